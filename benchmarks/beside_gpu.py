@@ -26,8 +26,8 @@ from vstent.flow.lattice.state import State
 from vstent.flow.problem import flow_case
 from vstent.flow.settings import FlowSettings, Numerics
 from vstent.geometry.vessel import Anatomy
-from vstent.study.ledger import Ledger
 from vstent.study.outputs import write_field
+from vstent.study.store import Key, Store
 
 Result = TypeVar("Result")
 COARSE_MM = 0.3
@@ -77,8 +77,8 @@ def table(anatomy: Anatomy, spacing_mm: float) -> None:
     timed("evaluation of a check", lambda: evaluate(engine, state))
     field = timed("wall shear stress and result", lambda: result_of(state))
     with TemporaryDirectory() as folder:
-        ledger = Ledger(Path(folder), lambda *_: None)
-        timed("storing a flow", lambda: ledger.keep("flow silk", "0", field))
+        store = Store(Path(folder))
+        timed("storing a flow", lambda: store.keep("flow silk", Key("0", "0"), field))
         timed("writing a flow", lambda: write_field(Path(folder), field))
     timed("indices and grade", lambda: grade(case, field, indices(field, case.sac, case.ostium)))
 

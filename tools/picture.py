@@ -11,7 +11,7 @@ from vstent.cli.console import Console
 from vstent.reporting.figures import overview
 from vstent.reporting.scene import scene_of
 from vstent.study import pipeline as study
-from vstent.study.provenance import RUN
+from vstent.study.folder import RUN
 from vstent.study.repeat import read_record
 
 PICTURE = Path(__file__).resolve().parents[1] / "docs" / "images" / "demo.png"

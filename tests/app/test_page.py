@@ -37,11 +37,11 @@ from vstent.io.dicom_writer import write_dicom
 from vstent.io.images import read_image
 from vstent.io.writers import write_stl
 from vstent.plan.uncertainty import Ranges
+from vstent.study import store as stored
 from vstent.study.flow_store import FlowStore
-from vstent.study.folder import CACHE, history_path
-from vstent.study.ledger import Ledger, hash_of
+from vstent.study.folder import CACHE
+from vstent.study.keys import hash_of, study_keys
 from vstent.study.repeat import settings_of
-from vstent.study.stages import flow_keys
 from vstent.study.types import InputSettings, Settings
 
 
@@ -466,8 +466,8 @@ def test_a_folder_of_vstent_run_opens_with_all_that_it_holds(study, tmp_path):
 
 def keep_flow(folder, source, settings, name):
     """Keep a flow as a study of these settings does."""
-    key = flow_keys(source, settings)[name]
-    Ledger(folder / CACHE, lambda *_: None).keep(f"flow {name}", key, report_case.field(1.0))
+    key = study_keys(source, settings)[f"flow {name}"]
+    stored.Store(folder / CACHE).keep(f"flow {name}", key, report_case.field(1.0))
 
 
 @pytest.fixture
@@ -717,7 +717,7 @@ def keep_contrast(folder):
         stored = np.full((3, len(carrier.cells)), 200, np.uint8)
         block = np.arange(len(carrier.cells))
         history = History(carrier.centers_mm, carrier.finest.cell_size_mm, block, np.arange(3) / 15, stored, 300.0)
-        save_data(history_path(path), history)
+        save_data(path.with_name(path.name.replace("flow ", "contrast ", 1)), history)
 
 
 def test_films_of_stored_contrast_come_along_any_direction(flown, tmp_path):

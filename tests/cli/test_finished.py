@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from vstent.cli import finished
-from vstent.study import folder
+from vstent.study.folder import CACHE, LAYOUT, LOCK, claimed
 
 PRINTED = "Neck inflow  −51 %\n"
 
 
-TOLD = {"input": {"sha256": "1"}, "seconds": {"trace": 1.0}}
+TOLD = {"layout": LAYOUT, "input": {"sha256": "1"}, "settings": {}, "seconds": {"trace": 1.0}}
 
 
 @pytest.fixture
@@ -23,13 +23,18 @@ def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Namespace:
     """A command on a scan of two files, with a waveform in a file and a device of the user's own."""
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     case, scan, devices = tmp_path / "case", tmp_path / "scan", tmp_path / "config" / "vstent" / "devices"
-    own = case / "report.html", case / finished.CACHE / "anatomy.npz"
+    own = case / "report.html", case / CACHE / "anatomy.npz"
     for file in (scan / "IM1.dcm", scan / "IM2.dcm", devices / "mine.toml", *own):
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text("content")
     (case / "run.json").write_text(json.dumps(TOLD | {"seconds": {"trace": 2.0}}))
     (tmp_path / "flow.csv").write_text("0,1")
     return Namespace(out=case, input=scan, device=["silk"], pulsatile=str(tmp_path / "flow.csv"), command=print)
+
+
+def remembered(command: Namespace) -> list[Path]:
+    """Return the records of finished commands."""
+    return [*(command.out / CACHE).glob(f"{finished.RECORD}-*")]
 
 
 @pytest.fixture
@@ -40,7 +45,6 @@ def done(command: Namespace) -> Namespace:
 
 
 def test_what_was_printed_is_printed_again(done: Namespace, capsys: pytest.CaptureFixture[str]) -> None:
-    assert finished.CACHE == folder.CACHE
     for _ in range(2):
         assert finished.answered(done)
         assert capsys.readouterr().out == PRINTED
@@ -52,14 +56,14 @@ FILES = (
     "case/.vstent/anatomy.npz",
     "flow.csv",
     "config/vstent/devices/mine.toml",
-    "case/.vstent/finished.json",
+    "case/.vstent/finished-*.json",
 )
 
 
 @pytest.mark.parametrize("name", FILES)
 @pytest.mark.parametrize("is_deleted", [True, False])
 def test_a_changed_file_is_noticed(done: Namespace, tmp_path: Path, name: str, is_deleted: bool) -> None:
-    file = tmp_path / name
+    (file,) = tmp_path.glob(name)
     file.unlink() if is_deleted else file.write_text("another")
     assert not finished.answered(done)
 
@@ -79,12 +83,12 @@ def test_a_file_that_changes_while_the_command_runs_is_noticed(command: Namespac
 
 
 def test_a_folder_that_another_process_uses_or_has_changed_is_not_remembered(command: Namespace) -> None:
-    before, record = finished.begun(command, command.input), command.out / finished.CACHE / finished.RECORD
-    with folder.claimed(command.out):
+    before = finished.begun(command, command.input)
+    with claimed(command.out):
         finished.remember(command, before, TOLD, PRINTED)
-    assert not record.exists()
+    assert remembered(command) == []
     finished.remember(command, before, TOLD | {"input": {"sha256": "2"}}, PRINTED)
-    assert not record.exists()
+    assert remembered(command) == []
 
 
 def test_another_command_program_terminal_or_process_is_noticed(
@@ -98,7 +102,7 @@ def test_another_command_program_terminal_or_process_is_noticed(
     with monkeypatch.context() as patch:
         patch.setenv("COLUMNS", "57")
         assert not finished.answered(command)
-    (command.out / finished.CACHE / finished.LOCK).touch()
+    (command.out / CACHE / LOCK).touch()
     assert not finished.answered(command)
 
 
@@ -106,10 +110,12 @@ def test_another_command_program_terminal_or_process_is_noticed(
 def test_a_command_that_depends_on_more_is_not_remembered(command: Namespace, option: str) -> None:
     asked = Namespace(**vars(command) | {option: True})
     finished.remember(asked, finished.begun(asked, asked.input), TOLD, PRINTED)
-    assert not (command.out / finished.CACHE / finished.RECORD).exists()
+    assert remembered(command) == []
 
 
 def test_the_answer_needs_none_of_the_computations() -> None:
-    code = "import sys, vstent.cli.finished, vstent.cli; print({'numpy', 'numba', 'rich'} & set(sys.modules))"
+    code = (
+        "import sys, vstent.cli.finished, vstent.cli; print({'numpy', 'numba', 'rich', 'pydantic'} & set(sys.modules))"
+    )
     done = subprocess.run([sys.executable, "-c", code], env=os.environ, capture_output=True, text=True, check=True)
     assert done.stdout == "set()\n"

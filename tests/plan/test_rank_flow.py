@@ -22,7 +22,9 @@ from vstent.plan import rank_flow
 from vstent.plan.rank import Ranking, rank
 from vstent.plan.rank_flow import chosen_of, rank_flows
 from vstent.study.flow_store import FlowStore
+from vstent.study.store import Key
 
+ARTERY = Key("anatomy", "code")
 SETTINGS = FlowSettings(inflow_mL_s=1.5, numerics=Numerics(cells_per_diameter=11.0, tolerance=0.02))
 
 
@@ -55,7 +57,6 @@ def test_the_best_of_every_device_is_among_the_chosen() -> None:
 
 
 def test_changes_are_those_of_flows_of_their_own_and_an_interrupted_ranking_goes_on(counted, tmp_path) -> None:
-    (tmp_path / ".vstent-cache").mkdir(exist_ok=True)
     seen: list[str] = []
 
     def stopping(done: int, total: int, name: str) -> None:
@@ -64,13 +65,11 @@ def test_changes_are_those_of_flows_of_their_own_and_an_interrupted_ranking_goes
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        rank_flows(
-            anatomy(), ranking(), SETTINGS, 2, stored=FlowStore(tmp_path, anatomy(), SETTINGS), progress=stopping
-        )
+        rank_flows(anatomy(), ranking(), SETTINGS, 2, stored=FlowStore(tmp_path, ARTERY, SETTINGS), progress=stopping)
     assert len(counted) == 2
-    found = rank_flows(anatomy(), ranking(), SETTINGS, 2, stored=FlowStore(tmp_path, anatomy(), SETTINGS))
+    found = rank_flows(anatomy(), ranking(), SETTINGS, 2, stored=FlowStore(tmp_path, ARTERY, SETTINGS))
     assert len(counted) == 4  # the flow without a device once more, and the one that was missing
-    again = rank_flows(anatomy(), ranking(), SETTINGS, 2, stored=FlowStore(tmp_path, anatomy(), SETTINGS))
+    again = rank_flows(anatomy(), ranking(), SETTINGS, 2, stored=FlowStore(tmp_path, ARTERY, SETTINGS))
     assert len(counted) == 4
     assert [one.label for one in found.candidates] == [one.label for one in ranking().candidates]
     with_flow = [one for one in found.candidates if "flow_grade" in one.measures]
@@ -146,10 +145,9 @@ def test_on_a_gpu_a_flow_is_measured_while_the_next_is_computed(monkeypatch: pyt
 
 
 def test_a_flow_of_a_device_whose_numbers_changed_is_not_found(tmp_path) -> None:
-    (tmp_path / ".vstent-cache").mkdir()
     one = chosen_of(ranking(), 1)[0]
-    FlowStore(tmp_path, anatomy(), SETTINGS)[one] = {"grade": "good"}
-    store = FlowStore(tmp_path, anatomy(), SETTINGS)
+    FlowStore(tmp_path, ARTERY, SETTINGS)[one] = {"grade": "good"}
+    store = FlowStore(tmp_path, ARTERY, SETTINGS)
     assert store.get(replace(one, score=0.5)) == {"grade": "good"}
     assert store.get(None) is None
     assert store.get(replace(one, shift_mm=one.shift_mm + 1.0)) is None

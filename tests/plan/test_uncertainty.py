@@ -11,7 +11,7 @@ from tubes import line, tube, with_neck
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.cli import main
-from vstent.cli.finished import CACHE, RECORD
+from vstent.cli.finished import RECORD
 from vstent.deployment.deploy import deploy
 from vstent.devices import catalogue, formulas
 from vstent.devices.ranges import altered, uncertain, values_at
@@ -25,7 +25,8 @@ from vstent.plan import uncertainty
 from vstent.plan.shares import first_order_shares
 from vstent.plan.uncertainty import CAUSES, Ranges, vary
 from vstent.plan.widening import widened
-from vstent.study.checkpoint import FlowCheckpoint
+from vstent.study.folder import CACHE
+from vstent.study.store import Unfinished
 
 SILK = replace(catalogue.find_design("silk"), ranges=())  # the numbers of the device are held where not said otherwise
 SIZE = catalogue.find_size(SILK, diameter_mm=4, length_mm=15)
@@ -260,7 +261,7 @@ def test_a_sample_whose_flow_is_done_is_not_computed_again(monkeypatch, tmp_path
     monkeypatch.setattr(uncertainty, "_flow_ratios", ratios)
     monkeypatch.setattr("vstent.flow.problem.ostium", lambda *_: None)
     ranges = Ranges(4, flow_samples=4, threshold_mm=0.0, landing_mm=0.5, device_mm=0.0)
-    begun, flow = FlowCheckpoint(tmp_path, "vary silk", "key"), FlowSettings(inflow_mL_s=4.0)
+    begun, flow = Unfinished(tmp_path, "vary silk-key"), FlowSettings(inflow_mL_s=4.0)
     with pytest.raises(KeyboardInterrupt):
         vary(artery(), deployed(), ranges, flow=flow, checkpoint=begun)
     resumed = vary(artery(), deployed(), ranges, flow=flow, checkpoint=begun)
@@ -288,7 +289,7 @@ def test_a_study_tells_its_uncertainty_in_metrics_report_and_table_and_goes_on_f
     assert "all diameters ±0.200\u202fmm" in section
     assert f"{interval['low']:.1f}\u202fmm and {interval['high']:.1f}\u202fmm" in section
     before = (out / "metrics.json").read_bytes()
-    (out / CACHE / RECORD).unlink()  # so that the command is not answered from its record
+    next((out / CACHE).glob(f"{RECORD}-*")).unlink()  # so that the command is not answered from its record
     assert main(command) == 0
     assert "vary enterprise" in capsys.readouterr().err
     assert (out / "metrics.json").read_bytes() == before

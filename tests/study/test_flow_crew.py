@@ -18,6 +18,7 @@ from vstent.study.crews import Processes
 from vstent.study.flow_crew import Common, FlowTask, compute_missing, parallel_flows
 from vstent.study.flow_store import FlowStore
 from vstent.study.folder import CACHE
+from vstent.study.store import Key
 
 SETTINGS = FlowSettings(inflow_mL_s=1.5, numerics=Numerics(cells_per_diameter=8.0, tolerance=0.05))
 
@@ -38,12 +39,12 @@ def test_a_killed_process_loses_one_flow_and_the_next_run_gives_the_bits_of_one_
     chosen, told = chosen_of(ranking(), 2), []
     assert not is_similar(*(coverage_of(one) for one in chosen))  # both start from the flow without a device
     monkeypatch.setattr(flow_crew, "work", killed)
-    store = FlowStore(tmp_path, anatomy(), SETTINGS)
+    store = FlowStore(tmp_path, Key("anatomy", "code"), SETTINGS)
     compute_missing(anatomy(), chosen, SETTINGS, store, Processes(2), progress=lambda *one: told.append(one[:2]))
     assert [done for done, _ in told] == [0, 1, 2, 3]
     assert "killed by signal 9 2 times" in store.get(chosen[1])["error"]
     monkeypatch.undo()
-    store = FlowStore(tmp_path, anatomy(), SETTINGS)
+    store = FlowStore(tmp_path, Key("anatomy", "code"), SETTINGS)
     assert store.get(chosen[1]) is None
     compute_missing(anatomy(), chosen, SETTINGS, store, Processes(2), progress=lambda *_: None)
     one_by_one: dict = {}

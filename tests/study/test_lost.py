@@ -18,9 +18,10 @@ from vstent.io.writers import write_stl
 from vstent.plan.rank import rank
 from vstent.plan.uncertainty import Ranges
 from vstent.study import stages
-from vstent.study.ledger import anatomy_key, key_of
+from vstent.study.keys import deployment_key, study_keys
 from vstent.study.outputs import write_ranking
 from vstent.study.pipeline import refine_flow, restore_vessel, run, trace_vessel
+from vstent.study.store import Key
 from vstent.study.types import Placing, Settings
 
 FLOW = FlowSettings(inflow_mL_s=2.0, numerics=Numerics(cell_size_mm=0.5, max_steps=20))
@@ -181,16 +182,34 @@ def test_a_flow_that_diverges_is_a_row_with_its_reason(
     assert "deployment" in case.metrics["stents"]["silk"]
 
 
-def test_keys_are_those_of_version_0_1_where_newer_settings_are_not_used() -> None:
-    assert anatomy_key("source", replace(PLAIN, without_flow=("silk",))) == anatomy_key("source", PLAIN)
-    assert key_of(Settings()) != key_of(Settings(without_flow=("silk",)))
+def test_keys_change_with_what_a_stage_uses_and_with_nothing_else() -> None:
+    keys = study_keys("source", Settings())
+    assert list(keys) == [
+        *("vessel", "anatomy", "deploy silk", "deploy enterprise"),
+        *("flow bare", "flow silk", "flow enterprise"),
+    ]
+
+    def changed(**settings: object) -> set[str]:
+        other = study_keys("source", replace(Settings(), **settings))
+        return {name for name in keys if name in other and other[name] != keys[name]}
+
+    assert changed(placings={"silk": Placing(4.0, 20.0)}) == {"deploy silk", "flow silk"}
+    assert changed(flow=FLOW) == {"flow bare", "flow silk", "flow enterprise"}
+    assert changed(outlet_mm=(0.0, 0.0, 0.0)) == {*keys} - {"vessel"}
+    assert changed(without_flow=("silk",)) == set()
+    assert changed(threshold=500.0) == {*keys}
 
 
-def test_flows_of_a_device_without_ranges_are_found_again():
-    design = find_design("silk")
+def test_a_deployment_is_found_again_though_ranges_and_sources_of_its_numbers_change() -> None:
+    design, anatomy = find_design("silk"), Key("given", "code")
     assert design.ranges
-    assert key_of(replace(design, ranges=())) == key_of(design)
-    assert key_of(replace(design, braid_angle_rad=1.1)) != key_of(design)
+    assert design.facts
+
+    def key(**numbers: object) -> Key:
+        return deployment_key(anatomy, PLAIN, "silk", replace(design, **numbers))
+
+    assert key(ranges=(), facts=()) == key()
+    assert key(braid_angle_rad=1.1) != key()
 
 
 def test_a_ranking_of_another_device_keeps_the_rows_of_the_former_one(

@@ -23,13 +23,14 @@ from vstent.geometry.image import Image
 from vstent.geometry.surface import Surface
 from vstent.io.dicom_writer import write_dicom
 from vstent.io.surfaces import read_surface
-from vstent.io.writers import write_json, write_stl
+from vstent.io.writers import write_stl
 from vstent.study import stages
 from vstent.study.crate import write_crate
-from vstent.study.ledger import Ledger, hash_of
+from vstent.study.keys import hash_of, study_keys
 from vstent.study.outputs import write_anatomy
 from vstent.study.pipeline import restore_vessel, run
 from vstent.study.stages import deploy_one, engine_folders, size_of
+from vstent.study.store import Key, Store
 from vstent.study.types import Placing, Settings
 
 
@@ -137,8 +138,8 @@ def test_a_folder_replaced_by_another_patient_s_holds_nothing_of_the_former(
         (out / name).parent.mkdir(parents=True, exist_ok=True)
         (out / name).write_text("of the first")
     (out / ".vstent" / "flow silk-1234.npz").write_text("kept")
-    if knows == "run.json":  # as version 0.1.0 left it
-        write_json(out / ".vstent" / "input.json", {"path": str(first)})
+    if knows == "run.json":
+        (out / ".vstent" / "input.json").unlink()
     before = {name: (out / name).read_bytes() for name in shown(out)}
     with pytest.raises(InputError):
         run(second, out, replace(settings, length_mm=1e3), lambda *_: None, replaces=True)
@@ -343,7 +344,7 @@ def test_on_a_gpu_a_flow_is_stored_while_the_next_is_computed(tmp_path: Path, mo
             is_next_begun.set()
         return SimpleNamespace(name=case, start=start, advice="")
 
-    def write(ledger: Ledger, name: str, key: str, result: object, seconds: dict[str, float]) -> None:
+    def write(store: Store, name: str, key: Key, result: object, seconds: dict[str, float]) -> None:
         assert is_next_begun.wait(20.0)
         threads.add(get_ident())
         stored.append((name, list(seconds)))
@@ -356,10 +357,10 @@ def test_on_a_gpu_a_flow_is_stored_while_the_next_is_computed(tmp_path: Path, mo
     monkeypatch.setattr(stages, "flow_case", lambda anatomy, implants, flow: implants[0].name if implants else "bare")
     monkeypatch.setattr(stages, "simulate_case", computed)
     monkeypatch.setattr(stages, "write_field", written)
-    monkeypatch.setattr(Ledger, "_write", write)
+    monkeypatch.setattr(Store, "_keep", write)
     silk = SimpleNamespace(stent=SimpleNamespace(name="silk", design=find_design("silk")))
-    ledger = Ledger(tmp_path / "cache", lambda *_: None)
-    fields, failures = stages.compute_flows(tmp_path, None, {"silk": silk}, settings, ledger, "")
+    store = Store(tmp_path / "cache")
+    fields, failures = stages.compute_flows(tmp_path, None, {"silk": silk}, settings, store, study_keys("", settings))
     assert not failures
     assert fields["silk"].start is fields["bare"]
     assert get_ident() not in threads
@@ -382,7 +383,8 @@ def test_a_device_whose_wires_change_does_not_get_the_flow_of_the_former(
     monkeypatch.setattr(stages, "simulate_case", computed_once)
     settings = Settings(devices=("silk",), flow=FlowSettings(numerics=Numerics(cell_size_mm=0.35)))
     run(artery, out, settings, lambda *_: None)
-    monkeypatch.setattr("vstent.study.pipeline.find_design", lambda _: replace(design, wires=((48, 40.0),)))
+    for module in ("pipeline", "keys"):
+        monkeypatch.setattr(f"vstent.study.{module}.find_design", lambda _: replace(design, wires=((48, 40.0),)))
     run(artery, out, settings, lambda *_: None)
     run(artery, out, settings, lambda *_: None)
     assert computed == [(), design.wires, ((48, 40.0),)]
@@ -395,7 +397,8 @@ def test_what_has_changed_is_written_again_and_nothing_else(arteries: tuple[Path
     dates = {path: path.stat().st_mtime_ns for path in files}
     (out / "stents" / "silk" / "struts.stl").write_text("of the user")
     (out / "stents" / "enterprise" / "wires.vtp").unlink()
-    (out / ".vstent" / "measure.done").write_text("{damaged")
+    (measured,) = (out / ".vstent").glob("measure-*.json")
+    measured.write_text("{damaged")
     second = run(arteries[0], out, settings, lambda *_: None)
     assert {path: path.read_bytes() for path in files} == files
     assert all(path.stat().st_mtime_ns > dates[path] for path in files)
@@ -407,17 +410,3 @@ def test_what_has_changed_is_written_again_and_nothing_else(arteries: tuple[Path
     dates = {path: path.stat().st_mtime_ns for path in files}
     run(arteries[0], out, settings, lambda *_: None)
     assert {path: path.stat().st_mtime_ns for path in files} == dates
-
-
-def test_another_state_of_the_program_computes_everything_anew(
-    arteries: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out, settings = tmp_path / "out", Settings(devices=("silk",), units="mm", flow=None)
-    run(arteries[0], out, settings, lambda *_: None)
-    first = json.loads((out / "run.json").read_text())["seconds"]
-    for module in ("stages", "pipeline"):
-        monkeypatch.setattr(f"vstent.study.{module}.code_key", lambda: "another")
-    run(arteries[0], out, settings, lambda *_: None)
-    again = json.loads((out / "run.json").read_text())["seconds"]
-    anew = {stage for stage in first if again[stage] != first[stage]}
-    assert anew == {"deploy silk", "struts silk", "measure"}

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from vstent.app.choices import Choices
 from vstent.errors import InputError, ReadError
 from vstent.io.files import atomic
+from vstent.study.folder import refuse_older
 
 if TYPE_CHECKING:  # imported when a study's settings are needed, as in `vstent.app.choices`
     from vstent.study.types import Settings
@@ -68,7 +69,7 @@ class State(BaseModel):
     failed_with: dict[str, str] = Field(default_factory=dict)
     """Digest of everything that a failed step depended on, by step."""
     anatomy: str = ""
-    """Key of the anatomy in the ledger."""
+    """Key of the anatomy in the case folder."""
     job: str = ""
     """Kind of the running job, also after the server was killed."""
 
@@ -284,7 +285,10 @@ def load(case_id: str, folder: Path) -> Case:
     ------
     ReadError
         The folder holds no state, or one that cannot be read.
+    InputError
+        It was written by an older version.
     """
+    refuse_older(folder)
     try:
         state = State.model_validate_json((folder / STATE).read_text(encoding="utf-8"))
     except FileNotFoundError:

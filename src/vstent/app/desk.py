@@ -144,7 +144,7 @@ class Desk:
 
     def point(self, case: Case, path: str) -> None:
         """Set the path of the scan or surface."""
-        from vstent.study.ledger import hash_of
+        from vstent.study.keys import hash_of
 
         source = hash_of(case.folder / path)
         case.update(input=path, source=source, revision=case.state.revision + 1)

@@ -33,9 +33,8 @@ def kept_flows(folder: Path) -> dict[str, Path]:
 
 def kept_histories(folder: Path) -> dict[str, Path]:
     """Return the stored contrast of all flows of the last finished study by name; empty where one is missing."""
-    from vstent.study.folder import history_path
-
-    paths = {name: history_path(path) for name, path in kept_flows(folder).items()}
+    flows = kept_flows(folder)
+    paths = {name: path.with_name("contrast" + path.name.removeprefix("flow")) for name, path in flows.items()}
     return paths if all(path.is_file() for path in paths.values()) else {}
 
 
@@ -65,21 +64,21 @@ def _flows_told(run: Path, _written_ns: int) -> dict[str, Path]:
 
     The time of writing is a parameter so that a changed file is read again.
     """
-    from vstent.study.repeat import UNTOLD, told_in
+    from vstent.study.repeat import told_in
+    from vstent.study.store import UNREADABLE
 
     try:
         told, settings = told_in(run)
         return _paths(run.parent, str(told["input"]["sha256"]), settings)
-    except (*UNTOLD, InputError):
+    except (*UNREADABLE, InputError):
         return {}
 
 
 def _paths(folder: Path, source: str, settings: "Settings") -> dict[str, Path]:
     """Return the files in which a study stores its flows, by name."""
     from vstent.study.folder import CACHE
-    from vstent.study.stages import flow_keys
+    from vstent.study.keys import study_keys
+    from vstent.study.store import Store
 
-    if settings.flow is None:
-        return {}
-    keys = flow_keys(source, settings)
-    return {name: folder / CACHE / f"flow {name}-{key}.npz" for name, key in keys.items()}
+    flows = {name: key for name, key in study_keys(source, settings).items() if name.startswith("flow ")}
+    return {name.removeprefix("flow "): Store(folder / CACHE).path(name, key) for name, key in flows.items()}

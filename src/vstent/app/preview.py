@@ -25,7 +25,8 @@ from vstent.geometry.vessel import Anatomy
 from vstent.io.archive import DAMAGE
 from vstent.reporting.packing import message
 from vstent.reporting.scene import LineLayer, scales_of, stream_layer
-from vstent.study.ledger import Ledger, key_of
+from vstent.study.keys import key_of
+from vstent.study.store import Key, Store
 
 if TYPE_CHECKING:  # imported by the process, so that the server does not wait for it
     from vstent.flow.lattice.live import LiveFlow
@@ -47,8 +48,6 @@ IDLE_S: Final = 600.0
 """Time without a request after which the process ends and frees its memory, in s."""
 FREE_BYTES: Final = 2e9
 """Free memory below which nothing is computed in advance, in bytes; the process of C0038 takes 0.5 GB."""
-LIVE_VERSION: Final = "0.2.0"
-"""Version of the live flow: it changes when its grid or its flow without a device changes."""
 STORED: Final = "live"
 """Name under which the flow without a device is stored."""
 STALE_S: Final = 1.5
@@ -132,13 +131,13 @@ class Shelf:
 
     folder: Path
     """Cache folder of the case."""
-    key: str
-    """Key of everything that the flow depends on."""
+    key: Key
+    """Key of the flow."""
 
 
 def shelf_of(folder: Path, anatomy: str, settings: FlowSettings) -> Shelf:
     """Return where the flow without a device is stored for an anatomy of this key and settings of the flow."""
-    return Shelf(folder, key_of(STORED, LIVE_VERSION, anatomy, settings))
+    return Shelf(folder, key_of("vstent.flow.lattice.live", anatomy, settings, without=("vstent.deployment",)))
 
 
 class Preview:
@@ -300,7 +299,7 @@ class _Store:
         """Return the live flow of a case, continued from the stored one where there is one."""
         from vstent.flow.lattice.live import BareFlow, LiveFlow
 
-        stored = None if self.shelf is None else self._ledger(self.shelf).stored(STORED, self.shelf.key, BareFlow)
+        stored = None if self.shelf is None else Store(self.shelf.folder).peek(STORED, self.shelf.key, BareFlow)
         if stored is not None:
             with suppress(*DAMAGE):
                 live = LiveFlow(case, stored=stored)
@@ -313,12 +312,7 @@ class _Store:
         if not self._is_current and self.shelf is not None:
             self._is_current = True
             with suppress(OSError):
-                self._ledger(self.shelf).keep(STORED, self.shelf.key, live.stored())
-
-    @staticmethod
-    def _ledger(shelf: Shelf) -> Ledger:
-        """Return the ledger of the cache folder."""
-        return Ledger(shelf.folder, lambda *_: None)
+                Store(self.shelf.folder).keep(STORED, self.shelf.key, live.stored())
 
 
 class _Worker:

@@ -14,8 +14,9 @@ from vstent.plan.rank_flow import rank_flows
 from vstent.reporting.definitions import DEFINITIONS
 from vstent.study.flow_store import FlowStore
 from vstent.study.folder import CACHE
-from vstent.study.ledger import Ledger, anatomy_key
+from vstent.study.keys import ANATOMY, anatomy_keys
 from vstent.study.stages import find_anatomy
+from vstent.study.store import Key, Store
 from vstent.study.types import OnProgress, Progress
 
 MOST_PROCESSES: Final = 4
@@ -57,8 +58,8 @@ def rank_sizes(case: Case, progress: OnProgress) -> None:
         The flow without a device cannot be computed.
     """
     settings = case.state.settings()
-    ledger = Ledger(case.folder / CACHE, progress)
-    anatomy = find_anatomy(case.input, case.state.source, settings, ledger)
+    keys = anatomy_keys(case.state.source, settings)
+    anatomy = find_anatomy(case.input, settings, Store(case.folder / CACHE, progress), keys)
 
     def told(n_done: int, n_all: int) -> None:
         progress(Progress("rank", min(n_done / n_all, 0.99), f"{n_done} of {n_all} sizes"))
@@ -68,34 +69,35 @@ def rank_sizes(case: Case, progress: OnProgress) -> None:
     n_sizes = sum(len(design.sizes) for design in designs)
     jobs = min(os.cpu_count() or 1, MOST_PROCESSES, 1 + n_sizes // WORTH_A_PROCESS)
     found = rank(anatomy, designs, jobs=jobs, progress=told)
-    key = anatomy_key(case.state.source, settings)
+    key = keys[ANATOMY]
     _write(case, key, found)
     progress(Progress("rank", 1.0, f"{len(found.suitable)} of {len(found.candidates)} sizes are suitable."))
     if case.state.choices.ranking_flows:
-        _write(case, key, _with_flows(case, anatomy, found, settings.flow or FlowSettings(), progress))
+        _write(case, key, _with_flows(case, anatomy, key, found, progress))
         progress(Progress("rank_flow", 1.0))
 
 
-def _with_flows(case: Case, anatomy: Anatomy, found: Ranking, settings: FlowSettings, progress: OnProgress) -> Ranking:
+def _with_flows(case: Case, anatomy: Anatomy, key: Key, found: Ranking, progress: OnProgress) -> Ranking:
     """Return the ranking with the flows of its best sizes."""
+    settings = case.state.settings().flow or FlowSettings()
     progress(Progress("rank_flow", 0.0))
     return rank_flows(
         anatomy,
         found,
         settings,
         case.state.choices.ranking_flows or 0,
-        stored=FlowStore(case.folder, anatomy, settings),
+        stored=FlowStore(case.folder, key, settings),
         progress=lambda done, n_all, name: progress(
             Progress("rank_flow", min(done / n_all, 0.99), f"{done} of {n_all}: {name}")
         ),
     )
 
 
-def _write(case: Case, anatomy: str, found: Ranking) -> None:
+def _write(case: Case, anatomy: Key, found: Ranking) -> None:
     """Store a ranking with the names of its devices and its columns."""
     rows = found.rows()
     content: dict[str, Any] = {
-        "anatomy": anatomy,
+        "anatomy": str(anatomy),
         "devices": sorted({candidate.design.key for candidate in found.candidates}),
         "names": {candidate.design.key: candidate.design.name for candidate in found.candidates},
         "columns": [

@@ -40,20 +40,20 @@ def reopened(store: Store, folder: Path) -> Case:
         The folder does not state its input and settings, is from another version, or has a setting that the page does
         not support.
     """
-    from vstent.study.folder import CACHE
-    from vstent.study.provenance import INPUT
-    from vstent.study.repeat import UNTOLD, told_in
+    from vstent.study.folder import CACHE, INPUT
+    from vstent.study.repeat import told_in
+    from vstent.study.store import UNREADABLE
 
     try:
         told, settings = told_in(folder / RUN)
         source = told["input"]["sha256"]
         where = json.loads((folder / CACHE / INPUT).read_text(encoding="utf-8"))["path"]
-    except UNTOLD:
+    except UNREADABLE:
         raise ReadError(
             f"{folder} was written by another version of vstent. Run the study again, or open its scan."
         ) from None
     choices = _choices(settings, folder)
-    anatomy = next((path.stem.rpartition("-")[2] for path in (folder / CACHE).glob("anatomy-*.npz")), "")
+    anatomy = next((path.stem.removeprefix("anatomy-") for path in (folder / CACHE).glob("anatomy-*.npz")), "")
     known = {"input": where, "source": source, "former": told["settings"], "choices": choices, "anatomy": anatomy}
     state = State(name=folder.name, **known)
     keys = dependencies(state)

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 from vstent.app.cases import Case, State
 from vstent.errors import VstentError
-from vstent.study.ledger import anatomy_key, hash_of
+from vstent.study.keys import ANATOMY, anatomy_keys, hash_of
 from vstent.study.pipeline import run
 from vstent.study.types import Progress
 
@@ -54,7 +54,7 @@ def find_anatomy(case: Case) -> None:
 
 def _anatomy_key(case: Case) -> str:
     """Return the key of the anatomy of a case."""
-    return anatomy_key(hash_of(case.input), case.state.settings())
+    return str(anatomy_keys(hash_of(case.input), case.state.settings())[ANATOMY])
 
 
 def compute(case: Case) -> None:

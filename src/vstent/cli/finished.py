@@ -6,7 +6,6 @@ command prints that again. This needs no import of the computations, which takes
 """
 
 import argparse
-import json
 import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping
@@ -14,15 +13,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from vstent.io.files import atomic
 from vstent.io.states import State, program_states, state_of
+from vstent.study.folder import CACHE, LOCK
+from vstent.study.store import UNREADABLE, Key, Store, digest
 
-CACHE: Final = ".vstent"
-"""Subfolder of the case folder with finished stages (as in `vstent.study.folder`, which imports the computations)."""
-RECORD: Final = "finished.json"
-"""File in that folder with the record."""
-LOCK: Final = "lock"
-"""File in that folder while a process uses the case folder, or has been killed."""
+RECORD: Final = "finished"
+"""Name of the record in the store."""
 DEPENDENT: Final = ("gpu", "angiogram", "plan", "ro_crate")
 """Options that depend on the machine or the day, or write files of their own: such commands run in full."""
 OF_TERMINAL: Final = ("COLUMNS", "TERM", "COLORTERM", "NO_COLOR", "FORCE_COLOR")
@@ -34,8 +30,8 @@ OF_CATALOGUE: Final = ("HOME", "XDG_CONFIG_HOME", "APPDATA")
 class Begun(NamedTuple):
     """What the output of a command depends on, as it was before the command ran."""
 
-    command: dict[str, Any]
-    """Arguments, program and terminal."""
+    command: Key
+    """Arguments and terminal, and the program."""
     states: dict[str, State]
     """States of the input, of files given as options, and of the user's devices, by path."""
 
@@ -43,16 +39,14 @@ class Begun(NamedTuple):
 def answered(arguments: argparse.Namespace) -> bool:
     """Print what a command printed when it was finished, if nothing has changed; return whether it was printed."""
     cache = arguments.out / CACHE
-    try:
-        kept = json.loads((cache / RECORD).read_text(encoding="utf-8"))
-        is_same = kept["command"] == _command(arguments) and not (cache / LOCK).exists()
-        if not is_same or any(state_of(Path(file)) != state for file, state in kept["files"].items()):
+    record = Store(cache).record(RECORD, _command(arguments))
+    with suppress(*UNREADABLE):
+        if (cache / LOCK).exists() or any(state_of(Path(file)) != state for file, state in record["files"].items()):
             return False
+        sys.stdout.write(record["printed"])
         print("vstent: nothing has changed since this command was finished.", file=sys.stderr)
-        print(kept["printed"], end="")
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return False
-    return True
+        return True
+    return False
 
 
 def begun(arguments: argparse.Namespace, source: Path) -> Begun:
@@ -85,20 +79,18 @@ def remember(arguments: argparse.Namespace, before: Begun, told: Mapping[str, An
     from vstent.errors import FolderError
     from vstent.plugins import plugins
     from vstent.study.folder import claimed
-    from vstent.study.repeat import SECONDS, is_of_another
+    from vstent.study.repeat import is_of_another
 
     if any(getattr(arguments, name, False) for name in DEPENDENT):
         return
     if plugins("vstent.devices") or plugins("vstent.engines") or plugins("vstent.walls"):
         return  # their code may change too
-    cache = arguments.out / CACHE
     with suppress(OSError, FolderError), claimed(arguments.out):
-        if is_of_another(arguments.out, {key: told[key] for key in told if key != SECONDS}):
+        if is_of_another(arguments.out, told):
             return
-        own = {file for file in arguments.out.rglob("*") if file.is_file()} - {cache / RECORD, cache / LOCK}
-        record = {"command": before.command, "files": _states(own) | before.states, "printed": printed}
-        with atomic(cache / RECORD) as partial:
-            partial.write_text(json.dumps(record))
+        own = {file for file in arguments.out.rglob("*") if file.is_file() and not file.name.startswith((RECORD, LOCK))}
+        files = _states(own) | before.states
+        Store(arguments.out / CACHE).write(RECORD, before.command, {}, files=files, printed=printed)
 
 
 def _inputs(source: Path) -> set[Path]:
@@ -119,19 +111,13 @@ def _states(files: Iterable[Path]) -> dict[str, State]:
     return {str(file.resolve()): state_of(file) for file in sorted(files)}
 
 
-def _command(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return everything but files that the output of a command depends on, as plain values."""
+def _command(arguments: argparse.Namespace) -> Key:
+    """Return the key of everything but files that the output of a command depends on."""
     given = {name: str(value) for name, value in vars(arguments).items() if not callable(value)}
     packages = [place for place in sys.path if place.endswith("-packages")]
     programs: dict[str, State] = program_states() | {place: state_of(Path(place)) for place in packages}
-    return {
-        "given": given,
-        "folder": os.getcwd(),
-        "programs": programs,
-        "python": sys.version,
-        "terminal": _terminal(),
-        "catalogue": [os.environ.get(name) for name in OF_CATALOGUE],
-    }
+    catalogue = [os.environ.get(name) for name in OF_CATALOGUE]
+    return Key(digest([given, os.getcwd(), _terminal(), catalogue]), digest([programs, sys.version]))
 
 
 def _terminal() -> list[Any]:

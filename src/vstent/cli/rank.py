@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from vstent.cli.console import Console
     from vstent.geometry.vessel import Anatomy
     from vstent.plan.rank import Ranking
+    from vstent.study.types import Settings
 
 SHOWN: Final = 15
 """Number of rows shown on the terminal; the files hold all."""
@@ -86,7 +87,7 @@ def _rank(arguments: argparse.Namespace) -> int:
             progress=lambda done, total: console.progress(Progress("rank", done / total, f"{done} of {total}")),
         )
         if arguments.flow_count:
-            ranking = _with_flows(arguments, anatomy, ranking, console)
+            ranking = _with_flows(arguments, anatomy, settings, ranking, console)
     write_ranking(arguments.out, ranking)
     console.print(ranking_table(ranking, SHOWN))
     console.print(ranking_reasons(ranking, SHOWN))
@@ -94,18 +95,22 @@ def _rank(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _with_flows(arguments: argparse.Namespace, anatomy: "Anatomy", ranking: "Ranking", console: "Console") -> "Ranking":
+def _with_flows(
+    arguments: argparse.Namespace, anatomy: "Anatomy", geometry: "Settings", ranking: "Ranking", console: "Console"
+) -> "Ranking":
     """Return the ranking with the flows of its best sizes; an interrupted one goes on."""
     from vstent.plan.rank_flow import chosen_of, rank_flows
     from vstent.study.flow_crew import compute_missing, parallel_flows
     from vstent.study.flow_store import FlowStore
+    from vstent.study.keys import ANATOMY, anatomy_keys, hash_of
     from vstent.study.types import Progress
 
     def told(done: int, total: int, name: str) -> None:
         console.progress(Progress("rank by flow", done / total, f"{done} of {total}: {name}"))
 
     settings, has_contrast = options.given_flow(arguments), arguments.retention
-    stored, chosen = FlowStore(arguments.out, anatomy, settings), chosen_of(ranking, arguments.flow_count)
+    key = anatomy_keys(hash_of(arguments.input), geometry)[ANATOMY]
+    stored, chosen = FlowStore(arguments.out, key, settings), chosen_of(ranking, arguments.flow_count)
     jobs, memory_MB = parallel_flows(anatomy, chosen, settings, min(arguments.jobs, len(chosen)))
     is_cluster = bool(arguments.scheduler or arguments.slurm)
     is_parallel = bool(anatomy.aneurysms and chosen) and (jobs > 1 or is_cluster)

@@ -12,7 +12,7 @@ from vstent.devices.treatment import Treatment, with_device
 from vstent.errors import InputError, ReadError
 from vstent.io.files import IMAGE_SUFFIXES, SURFACE_SUFFIXES, suffix
 from vstent.io.tables import finite
-from vstent.study.ledger import hash_of, key_of, refuse_missing
+from vstent.study.keys import hash_of, measures_key, refuse_missing, study_keys
 from vstent.study.types import Settings
 from vstent.study.written import code_key
 from vstent.units import MM_PER
@@ -34,13 +34,11 @@ class Case:
     @cached_property
     def keys(self) -> dict[str, str]:
         """Key of the row of every treatment; it covers everything that the row depends on."""
-        source = hash_of(self.path)
-        return {
-            one.name: key_of(
-                code_key(), source, replace(self.settings, treatments=(one,)), *map(find_design, one.devices)
-            )
-            for one in self.settings.treatments
-        }
+        source, keys = hash_of(self.path), {}
+        for treatment in self.settings.treatments:
+            alone = replace(self.settings, treatments=(treatment,))
+            keys[treatment.name] = str(measures_key(alone, study_keys(source, alone), {}))
+        return keys
 
 
 def find_cases(cohort: Path, settings: Settings) -> tuple[Case, ...]:

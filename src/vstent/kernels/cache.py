@@ -31,8 +31,8 @@ def choose_folder() -> None:
         os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(tempfile.gettempdir()) / f"vstent-{os.getuid()}"))
 
 
-def _kept_in(sources: Path) -> Path:
-    """Return the folder where numba keeps what it compiles from a source folder."""
+def kept_in(sources: Path) -> Path:
+    """Return the folder where numba keeps what it compiles from a source folder; it is writable."""
     name = f"{sources.name}_{sha1(str(sources).encode(), usedforsecurity=False).hexdigest()}"
     if given := os.environ.get("NUMBA_CACHE_DIR"):
         return Path(given) / name
@@ -52,7 +52,7 @@ def forget_outdated(sources: Path, *also: Path) -> None:
     also : Path
         Further folders with functions that they call.
     """
-    place = _kept_in(sources)
+    place = kept_in(sources)
     files = [file for folder in (sources, *also) for file in sorted(folder.glob("*.py"))]
     digest = sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
     try:

@@ -13,9 +13,8 @@ from vstent.reporting.films import Density, shown_of, write_films
 from vstent.reporting.write import write_report
 from vstent.study.contrast import FOLDER, angiograms
 from vstent.study.films import Recording, stents_of
-from vstent.study.folder import claimed
+from vstent.study.folder import RUN, claimed
 from vstent.study.pipeline import run
-from vstent.study.provenance import RUN
 from vstent.study.repeat import finished_run, read_record
 from vstent.study.types import OnProgress, Progress
 

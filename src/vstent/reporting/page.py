@@ -185,7 +185,6 @@ def _limits_of_flow(flow: Mapping[str, Any]) -> list[str]:
     thins, engine = flow["blood"]["thinning"] is not None, flow["numerics"]["engine"]
     blood = "Blood is shear-thinning, with parameters from the literature" if thins else "Blood is Newtonian"
     told = [f"{blood}, and the wall is rigid; {AT_OUTLETS[flow['outlets']]}."]
-    engine = flow["numerics"]["engine"]
     return [*told, OF_DEVICE[engine]] if engine in OF_DEVICE else told
 
 

@@ -1,26 +1,26 @@
 """Write the report of a case as HTML, and optionally as PDF."""
 
 import hashlib
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from vstent.io.files import atomic
 from vstent.io.writers import write_text
 from vstent.reporting.drawing import Drawing
-from vstent.reporting.films import kept_films
+from vstent.reporting.films import KeptFilms, kept_films
 from vstent.reporting.page import as_html, contents_of, with_films
 from vstent.reporting.pdf import as_pdf
 from vstent.reporting.plan_sheet import Planned, plan_pdf
 from vstent.study.folder import CACHE
-from vstent.study.ledger import key_of
+from vstent.study.keys import key_of
 from vstent.study.repeat import SECONDS
+from vstent.study.store import Store
 
 if TYPE_CHECKING:
     from vstent.study.types import CaseResult
 
-DRAWN: Final = "report.key"
-"""File in the cache folder with the key of the results that the report shows."""
+ASSETS: Final = Path(__file__).with_name("assets")
+"""Folder of the report's templates, styles and scripts."""
 
 
 def write_plan(case: "CaseResult", out: Path, day: str) -> None:
@@ -48,31 +48,22 @@ def write_report(case: "CaseResult", out: Path, *, is_printed: bool = False, dra
     is_printed : whether to write the PDF too.
     drawing : the pictures of the case, if they are being drawn already.
     """
-    drawn = out / CACHE / DRAWN
-    key = key_of(
-        version("vstent"), case.metrics, case.notes, {k: v for k, v in case.provenance.items() if k != SECONDS}
-    )
     films = kept_films(out)
-    if films is not None:
-        shown = b"".join([*(one.image.tobytes() for one in films.pictures), films.animation])
-        key = key_of(key, hashlib.sha256(shown).hexdigest())
-    wanted = ["report.html"] + ["report.pdf"] * is_printed
-    if all((out / name).is_file() for name in wanted) and _text(drawn) == key:
-        return  # painting takes seconds, and would give the same pictures
-    drawn.unlink(missing_ok=True)
+    told = {name: value for name, value in case.provenance.items() if name != SECONDS}
+    shown = [] if films is None else [*(one.image.tobytes() for one in films.pictures), films.animation]
+    files = [*shown, *(file.read_bytes() for file in sorted(ASSETS.iterdir()))]
+    digests = [hashlib.sha256(one).hexdigest() for one in files]
+    key = key_of(f"{__name__}:_write", list(case.keys.values()), case.metrics, case.notes, told, digests)
+    names = ["report.html"] + ["report.pdf"] * is_printed
+    Store(out / CACHE).write_once("report", key, out, names, lambda: _write(case, out, names, drawing, films))
+
+
+def _write(case: "CaseResult", out: Path, names: list[str], drawing: Drawing | None, films: KeptFilms | None) -> str:
+    """Write the report in the files named; return a sentence."""
     told = contents_of(case, drawing)
     told = told if films is None else with_films(told, films)
     write_text(out / "report.html", as_html(told))
-    if is_printed:
+    if "report.pdf" in names:
         with atomic(out / "report.pdf") as partial:
             partial.write_bytes(as_pdf(told))
-    if drawn.parent.is_dir():
-        write_text(drawn, key)
-
-
-def _text(path: Path) -> str:
-    """Return the text of a file; empty where it cannot be read."""
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, ValueError):
-        return ""
+    return ""

@@ -1,9 +1,6 @@
 """Study of one patient: an input file and `Settings` in, a case folder with all results out; a rerun resumes.
 
-Open ``pipeline.py`` first; ``stages.py`` holds the stages in their order.
+Open ``pipeline.py`` first; ``stages.py`` holds the stages in their order, ``store.py`` keeps their results under the
+keys of ``keys.py``.
 """
 
-from vstent.study.pipeline import refine_flow, restore_vessel, run, trace_vessel
-from vstent.study.types import CaseResult, OnProgress, Progress, Settings
-
-__all__ = ["CaseResult", "OnProgress", "Progress", "Settings", "refine_flow", "restore_vessel", "run", "trace_vessel"]

@@ -18,11 +18,11 @@ from vstent.geometry.vessel import Anatomy
 from vstent.io.tables import write_rows
 from vstent.io.writers import write_json
 from vstent.study.folder import CACHE, claimed
-from vstent.study.ledger import ANATOMY, CONTRAST_VERSION, Ledger, anatomy_key, key_of
+from vstent.study.keys import ANATOMY, angiogram_key, study_keys
 from vstent.study.provenance import METRICS
-from vstent.study.repeat import UNTOLD, finished_run
-from vstent.study.stages import flow_keys
-from vstent.study.types import OnProgress, Settings
+from vstent.study.repeat import finished_run
+from vstent.study.store import UNREADABLE, Key, Store
+from vstent.study.types import OnProgress
 
 FOLDER: Final = "angiogram"
 """Subfolder of the case folder with the results."""
@@ -31,9 +31,9 @@ CURVES: Final = "curves.csv"
 NUMBERS: Final = "angiogram.json"
 """File with settings, measures and advice of all flows."""
 
-Record = Callable[[str, Path, Callable[[], FlowField | None]], AbstractContextManager[Watch | None]]
-"""Takes the name of a flow, its stored file and what reads it (None where there is none); its context yields what
-watches the frames, or None."""
+Record = Callable[[str, Key, Store, Callable[[], FlowField | None]], AbstractContextManager[Watch | None]]
+"""Takes the name of a flow, its key, the store, and what reads the flow (None where there is none); its context yields
+what watches the frames, or None."""
 
 
 def angiograms(
@@ -66,33 +66,36 @@ def angiograms(
     """
     source, study = finished_run(out)
     with claimed(out):
-        ledger = Ledger(out / CACHE, progress)
-        anatomy = ledger.recall(ANATOMY, anatomy_key(source, study), Anatomy)
+        store = Store(out / CACHE, progress)
+        keys = study_keys(source, study)
+        anatomy = store.find(ANATOMY, keys[ANATOMY], Anatomy)
         if anatomy is None:
             raise ReadError(f"{out} does not hold the artery of its run: give the same command as for that run again")
-        found = {
-            name: _one(out, anatomy, name, key, settings, ledger, record)
-            for name, key in flow_keys(source, study).items()
-        }
-        _write(out, found, settings, flow_keys(source, study))
+        flows = _flow_keys(keys)
+        found = {name: _one(out, anatomy, name, key, settings, store, record) for name, key in flows.items()}
+        _write(out, found, settings, flows)
     return found
+
+
+def _flow_keys(keys: Mapping[str, Key]) -> dict[str, Key]:
+    """Return the keys of the flows of a run by treatment, ``bare`` first."""
+    return {stage.removeprefix("flow "): key for stage, key in keys.items() if stage.startswith("flow ")}
 
 
 def _one(
     out: Path,
     anatomy: Anatomy,
     name: str,
-    key: str,
+    key: Key,
     settings: AngiogramSettings,
-    ledger: Ledger,
+    store: Store,
     record: Record | None,
 ) -> Angiogram:
     """Return the angiogram of one flow, stored or computed."""
-    stored = ledger.folder / f"flow {name}-{key}.npz"
-    stage, own = f"angiogram {name}", key_of(CONTRAST_VERSION, key, settings)
-    carrier = cache(lambda: ledger.recall(f"flow {name}", key, FlowField))
-    with nullcontext() if record is None else record(name, stored, carrier) as watch:
-        found = None if watch else ledger.recall(stage, own, Angiogram)
+    stage, own = f"angiogram {name}", angiogram_key(key, settings)
+    carrier = cache(lambda: store.find(f"flow {name}", key, FlowField))
+    with nullcontext() if record is None else record(name, key, store, carrier) as watch:
+        found = None if watch else store.find(stage, own, Angiogram)
         if found is not None:
             return found
         field = carrier()
@@ -100,31 +103,33 @@ def _one(
             raise InputError(
                 f"{out} holds no flow of {name}, and contrast moves with the flow: run the case again without --no-flow"
             )
-        with ledger.stage(stage) as tell:
-            found = angiogram(anatomy, field, settings, watch=watch, progress=_teller(ledger, stage))
+        with store.stage(stage) as tell:
+            found = angiogram(anatomy, field, settings, watch=watch, progress=_teller(store, stage))
             tell(found.advice)
-        ledger.keep(stage, own, found)
+        store.keep(stage, own, found)
         return found
 
 
-def _teller(ledger: Ledger, stage: str) -> Callable[[float], None]:
+def _teller(store: Store, stage: str) -> Callable[[float], None]:
     """Return a function that reports a finished fraction with the time that is left."""
     began = time.monotonic()
 
     def tell(part: float) -> None:
         left_s = (time.monotonic() - began) * (1 - part) / part if part > 0 else None
-        ledger.progress(stage, 0.99 * part, "", seconds_left=left_s)
+        store.progress(stage, 0.99 * part, "", seconds_left=left_s)
 
     return tell
 
 
-def _write(out: Path, found: Mapping[str, Angiogram], settings: AngiogramSettings, keys: Mapping[str, str]) -> None:
+def _write(out: Path, found: Mapping[str, Angiogram], settings: AngiogramSettings, keys: Mapping[str, Key]) -> None:
     """Write the curves, the numbers, and the metrics with the numbers added."""
     folder = out / FOLDER
     folder.mkdir(exist_ok=True)
     former = _former_keys(folder / NUMBERS)
     write_rows(folder / CURVES, list(_rows(found)))
-    flows = {name: {"flow": keys[name], "measures": one.measures, "advice": one.advice} for name, one in found.items()}
+    flows = {
+        name: {"flow": str(keys[name]), "measures": one.measures, "advice": one.advice} for name, one in found.items()
+    }
     write_json(folder / NUMBERS, {"settings": asdict(settings), "flows": flows, "research_use_only": True})
     metrics = json.loads((out / METRICS).read_text(encoding="utf-8"))
     _drop(metrics, former)
@@ -150,7 +155,7 @@ def _former_keys(path: Path) -> set[str]:
     try:
         flows = json.loads(path.read_text(encoding="utf-8"))["flows"]
         return {key for one in flows.values() for key in one["measures"]}
-    except UNTOLD:
+    except UNREADABLE:
         return set()
 
 
@@ -178,18 +183,17 @@ def add_measures(metrics: dict[str, Any], measures: Mapping[str, Mapping[str, fl
             treatment["change"].update(ratios(dict(measures.get(BARE, {})), dict(values)))
 
 
-def kept_measures(out: Path, source: str, study: Settings) -> dict[str, dict[str, float]]:
+def kept_measures(out: Path, keys: Mapping[str, Key]) -> dict[str, dict[str, float]]:
     """Return the measures of the angiograms in a case folder that belong to the flows of a run, by name.
 
     Parameters
     ----------
     out : the case folder.
-    source : SHA-256 of the input.
-    study : settings of the run.
+    keys : keys of the run's stages.
     """
     try:
         flows = json.loads((out / FOLDER / NUMBERS).read_text(encoding="utf-8"))["flows"]
-        keys = flow_keys(source, study)
-        return {name: dict(one["measures"]) for name, one in flows.items() if one["flow"] == keys.get(name)}
-    except UNTOLD:
+        own = {name: str(key) for name, key in _flow_keys(keys).items()}
+        return {name: dict(one["measures"]) for name, one in flows.items() if one["flow"] == own.get(name)}
+    except UNREADABLE:
         return {}

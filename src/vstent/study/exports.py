@@ -20,11 +20,11 @@ from vstent.flow.problem import flow_case
 from vstent.geometry.vessel import Anatomy
 from vstent.io import writers
 from vstent.io.archive import load_data
-from vstent.study.folder import CACHE
-from vstent.study.ledger import Ledger, hash_of
-from vstent.study.provenance import RUN
+from vstent.study.folder import CACHE, RUN
+from vstent.study.keys import anatomy_keys, hash_of
 from vstent.study.repeat import finished_run
 from vstent.study.stages import check_inflow, deploy_implant, find_anatomy
+from vstent.study.store import Store
 from vstent.study.types import OnProgress, Settings
 
 
@@ -53,13 +53,13 @@ def export_openfoam(
     InputError
         An input or option cannot be used; nothing has been written.
     """
-    ledger = Ledger(out / CACHE, progress)
-    anatomy = _anatomy(path, settings, ledger)
+    store = Store(out / CACHE, progress)
+    anatomy = _anatomy(path, settings, store)
     check_inflow(anatomy, settings.flow)
-    case = flow_case(anatomy, _implants(path, anatomy, settings, ledger), settings.flow)
+    case = flow_case(anatomy, _implants(path, anatomy, settings, store), settings.flow)
     setup = FoamSetup(default_cell_size_mm(case))
     setup = replace(setup, **{"flavour": _flavour_here(), **foam}, struts=strut_solids(case))
-    with ledger.stage("export") as tell:
+    with store.stage("export") as tell:
         written = foam_case(case, setup)
         write(out, written)
         tell(f"{len(written.files)} files for {written.application}, grid spacing {setup.cell_size_mm:.3g} mm.")
@@ -84,9 +84,9 @@ def export_patches(path: Path, out: Path, settings: Settings, progress: OnProgre
     InputError
         An input or option cannot be used; nothing has been written.
     """
-    ledger = Ledger(out / CACHE, progress)
-    case = flow_case(_anatomy(path, settings, ledger))
-    with ledger.stage("export") as tell:
+    store = Store(out / CACHE, progress)
+    case = flow_case(_anatomy(path, settings, store))
+    with store.stage("export") as tell:
         patches, _ = named_patches(case)
         patch_id = np.zeros(len(patches[0].surface.faces), dtype=np.int32)
         said = []
@@ -111,11 +111,11 @@ def _middle(corners_mm: np.ndarray) -> dict[str, Any]:
     return {"center_mm": center_mm, "normal": total / max(float(np.linalg.norm(total)), 1e-12)}
 
 
-def _anatomy(path: Path, settings: Settings, ledger: Ledger) -> Anatomy:
+def _anatomy(path: Path, settings: Settings, store: Store) -> Anatomy:
     """Return the anatomy stored in a case folder, or that of an input."""
     kept = sorted((path / CACHE).glob("anatomy-*.npz")) if path.is_dir() else []
     if not kept:
-        return find_anatomy(path, hash_of(path), settings, ledger)
+        return find_anatomy(path, settings, store, anatomy_keys(hash_of(path), settings))
     given = [
         field.name
         for part in (settings.input, settings.anatomy)
@@ -125,13 +125,13 @@ def _anatomy(path: Path, settings: Settings, ledger: Ledger) -> Anatomy:
     if given:
         words = ", ".join(f"--{name.removesuffix('_mm')}" for name in given)
         raise InputError(f"{path} is a case folder, whose vessel is exported as it is: leave out {words}")
-    with ledger.stage("anatomy") as tell:
+    with store.stage("anatomy") as tell:
         anatomy = load_data(kept[-1], Anatomy)
         tell(f"taken from {path}")
     return anatomy
 
 
-def _implants(path: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> list[Stent]:
+def _implants(path: Path, anatomy: Anatomy, settings: Settings, store: Store) -> list[Stent]:
     """Return the implants of the first treatment, as given, else as in the case folder's own run, else as proposed."""
     if not settings.treatments:
         return []
@@ -141,7 +141,7 @@ def _implants(path: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) 
         treatment = found.get(treatment.name, treatment)
     stents: dict[str, Stent] = {}
     for implant in treatment.implants:
-        with ledger.stage(f"deploy {implant.id}") as tell:
+        with store.stage(f"deploy {implant.id}") as tell:
             deployment = deploy_implant(implant, anatomy, [stents[name] for name in implant.inside])
             tell(deployment.advice)
         stents[implant.id] = deployment.stent

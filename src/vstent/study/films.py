@@ -1,7 +1,7 @@
 """Stored contrast of a case folder, from which films along any direction are made."""
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -11,11 +11,11 @@ from vstent.devices.stent import Stent
 from vstent.errors import ReadError
 from vstent.flow.case import FlowField
 from vstent.geometry.vessel import Anatomy
-from vstent.io.archive import load_data, save_data
-from vstent.study.folder import CACHE, history_path
-from vstent.study.ledger import ANATOMY, CONTRAST_VERSION, Ledger, anatomy_key, key_of
+from vstent.study.folder import CACHE
+from vstent.study.keys import ANATOMY, angiogram_key, study_keys
 from vstent.study.repeat import finished_run
 from vstent.study.stages import deploy_all
+from vstent.study.store import Key, Store
 
 
 @dataclass(frozen=True)
@@ -31,17 +31,21 @@ class Recording:
     """Contrast by name of the flow; filled by the calls."""
 
     @contextmanager
-    def __call__(self, name: str, flow: Path, carrier_of: Callable[[], FlowField | None]) -> Iterator[Watch | None]:
+    def __call__(
+        self, name: str, flow: Key, store: Store, carrier_of: Callable[[], FlowField | None]
+    ) -> Iterator[Watch | None]:
         """Yield what watches the frames of a flow, or None where they are stored.
 
         Parameters
         ----------
         name : name of the flow.
-        flow : its stored file.
+        flow : its key. The contrast is stored under it, so that it is found without the injection.
+        store : results of the case.
         carrier_of : returns the flow, None where there is none.
         """
-        path, key = history_path(flow), key_of(CONTRAST_VERSION, self.settings)
-        kept = _kept(path, key)
+        stage, key = f"contrast {name}", str(angiogram_key(flow, self.settings))
+        kept = store.peek(stage, flow, History)
+        kept = kept if kept is not None and kept.key == key else None
         carrier = carrier_of() if kept is None else None
         if carrier is None:
             yield None
@@ -50,19 +54,9 @@ class Recording:
             recorder = Recorder(carrier, entering(bolus, carrier)[1], key, bolus.begin_s)
             yield recorder.watch
             kept = recorder.history()
-            for former in path.parent.glob(f"contrast {name}-*.npz"):
-                former.unlink()
-            save_data(path, kept)
+            store.keep(stage, flow, kept)
         if kept is not None:
             self.histories[name] = kept
-
-
-def _kept(path: Path, key: str) -> History | None:
-    """Return the stored contrast where it is that of an injection; None where there is none."""
-    with suppress(ReadError):
-        found = load_data(path, History)
-        return found if found.key == key else None
-    return None
 
 
 def stents_of(out: Path, names: Iterable[str]) -> tuple[Anatomy, dict[str, list[Stent]]]:
@@ -79,8 +73,10 @@ def stents_of(out: Path, names: Iterable[str]) -> tuple[Anatomy, dict[str, list[
         The folder holds no finished run of this version.
     """
     source, study = finished_run(out)
-    ledger = Ledger(out / CACHE, lambda *_: None)
-    anatomy = load_data(out / CACHE / f"{ANATOMY}-{anatomy_key(source, study)}.npz", Anatomy)
+    store, keys = Store(out / CACHE), study_keys(source, study)
+    anatomy = store.peek(ANATOMY, keys[ANATOMY], Anatomy)
+    if anatomy is None:
+        raise ReadError(f"{out} does not hold the artery of its run: give the same command as for that run again")
     chosen = replace(study, treatments=tuple(one for one in study.treatments if one.name in set(names)))
-    deployed = deploy_all(anatomy, chosen, ledger, source)[0] if chosen.treatments else {}
+    deployed = deploy_all(anatomy, chosen, store, keys)[0] if chosen.treatments else {}
     return anatomy, {name: [one.stent for one in found.values()] for name, found in deployed.items()}

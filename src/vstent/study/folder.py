@@ -1,5 +1,6 @@
 """Reserve a case folder for one process, and leave no half-written files in it."""
 
+import json
 import os
 import platform
 from collections.abc import Callable, Iterator
@@ -8,11 +9,20 @@ from functools import wraps
 from pathlib import Path
 from typing import IO, Concatenate, Final, ParamSpec, TypeVar
 
-from vstent.errors import FolderError
+from vstent.errors import FolderError, InputError
 from vstent.io.files import sweep
+from vstent.study.store import UNREADABLE
 
 CACHE: Final = ".vstent"
-"""Subfolder of the case folder with finished stages and the lock."""
+"""Subfolder of the case folder with the store and the lock."""
+RUN: Final = "run.json"
+"""File of the case folder with the provenance of the run."""
+INPUT: Final = "input.json"
+"""File in the cache folder with the path of the input; not for sharing, because the path may name the patient."""
+LAYOUT: Final = 3
+"""Number of the layout of case folders, as stated by the files `RUN` and `INPUT`."""
+LOCK: Final = "lock"
+"""File in that folder while a process uses the case folder, or has been killed."""
 
 TREATMENTS: Final = "treatments"
 """Subfolder of the case folder with a folder for every treatment."""
@@ -50,9 +60,14 @@ def flow_folder(out: Path, treatment: str) -> Path:
     return out / TREATMENTS / treatment / "flow"
 
 
-def history_path(flow: Path) -> Path:
-    """Return the file with the contrast that a flow carries over time, from the file with the flow."""
-    return flow.with_name("contrast" + flow.name.removeprefix("flow"))
+def refuse_older(out: Path) -> None:
+    """Raise InputError where a folder is a case folder of another layout."""
+    for path in (out / CACHE / INPUT, out / RUN):
+        with suppress(*UNREADABLE):
+            if json.loads(path.read_text(encoding="utf-8")).get("layout") != LAYOUT:
+                raise InputError(
+                    f"{out} was written by an older version of vstent. Give another --out, or delete that folder."
+                )
 
 
 @contextmanager
@@ -70,12 +85,15 @@ def claimed(out: Path) -> Iterator[None]:
     ------
     FolderError
         Another process uses the folder, or it cannot be written.
+    InputError
+        It is a case folder of an older version.
     """
+    refuse_older(out)
     cache = out / CACHE
     made = [folder for folder in (cache, out, *out.parents) if not folder.exists()]
     try:
         cache.mkdir(parents=True, exist_ok=True)
-        lock = _locked(cache / "lock")
+        lock = _locked(cache / LOCK)
     except OSError as error:
         _drop(made)
         raise FolderError(f"{out} cannot be written ({error.strerror}): give another --out") from None
@@ -83,7 +101,7 @@ def claimed(out: Path) -> Iterator[None]:
         sweep(out)
         yield
     finally:
-        (cache / "lock").unlink(missing_ok=True)
+        (cache / LOCK).unlink(missing_ok=True)
         lock.close()
         _drop([cache, *made[1:]])
 

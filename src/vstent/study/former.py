@@ -13,9 +13,9 @@ from typing import Any, Final
 from vstent.devices.treatment import Treatment
 from vstent.errors import InputError
 from vstent.io.writers import write_json
-from vstent.study.folder import CACHE
-from vstent.study.provenance import RUN
-from vstent.study.repeat import UNTOLD, former_source, settings_of
+from vstent.study.folder import CACHE, RUN
+from vstent.study.repeat import former_source, settings_of
+from vstent.study.store import UNREADABLE
 from vstent.study.types import Settings
 
 BEGUN: Final = "settings.json"
@@ -25,7 +25,7 @@ BEGUN: Final = "settings.json"
 def former_settings(out: Path) -> Settings | None:
     """Return the settings of the last run of a case folder; None where there is none, or they cannot be read."""
     for path in (out / CACHE / BEGUN, out / RUN):
-        with suppress(*UNTOLD):
+        with suppress(*UNREADABLE):
             told = json.loads(path.read_text(encoding="utf-8"))
             return settings_of(told["settings"])
     return None

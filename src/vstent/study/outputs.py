@@ -21,7 +21,8 @@ from vstent.io.tables import columns_of, write_rows
 from vstent.io.three_mf import write_3mf
 from vstent.plan.rank import Ranking, order_of
 from vstent.study.crate import NAME as CRATE
-from vstent.study.provenance import METRICS, RUN
+from vstent.study.folder import RUN
+from vstent.study.provenance import METRICS
 
 IMPLANT: Final = ("contour.vtp", "wires.vtp", "struts.stl", "struts.3mf")
 """Files of one implant."""

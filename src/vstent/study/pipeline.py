@@ -20,9 +20,9 @@ from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io import writers
 from vstent.study.contrast import add_measures, kept_measures
 from vstent.study.crate import NAME as CRATE
-from vstent.study.folder import CACHE, claiming, implant_folder
+from vstent.study.folder import CACHE, INPUT, LAYOUT, RUN, claiming, implant_folder
 from vstent.study.former import merged, note_begun, refuse_other_anatomy, refuse_other_input
-from vstent.study.ledger import ANATOMY, Ledger, hash_of, key_of, vessel_key
+from vstent.study.keys import ANATOMY, VESSEL, anatomy_keys, hash_of, key_of, measures_key, study_keys
 from vstent.study.outputs import (
     IMPLANT,
     take_away_measures,
@@ -32,24 +32,22 @@ from vstent.study.outputs import (
     write_implant,
     write_vessel,
 )
-from vstent.study.provenance import INPUT, METRICS, RUN, provenance
+from vstent.study.provenance import METRICS, provenance
 from vstent.study.repeat import SECONDS, former_source, is_of_another
 from vstent.study.stages import (
-    band_all,
     check_inflow,
     compute_flows,
     deploy_all,
     engine_folders,
     find_anatomy,
     find_vessel,
-    implant_keys,
-    measure_all,
+    measure_study,
     refine,
     stage_name,
     vary_all,
 )
+from vstent.study.store import Store
 from vstent.study.types import CaseResult, Computed, OnProgress, Progress, Settings
-from vstent.study.written import code_key, compute_once, write_once
 
 Implants = Mapping[str, Mapping[str, Deployment]]
 """Deployed implants by treatment and id."""
@@ -92,65 +90,55 @@ def run(
     FolderError
         Another process uses the folder, or it cannot be written.
     """
-    ledger = Ledger(out / CACHE, progress)
+    store = Store(out / CACHE, progress)
     source = hash_of(path)
     if not replaces:
         settings = merged(out, source, settings)
-    for device in settings.devices:
-        find_design(device)  # an unknown device is reported before anything is computed
-    anatomy = find_anatomy(path, source, settings, ledger)
+    keys = study_keys(source, settings)
+    store.foretell(keys)
+    anatomy = find_anatomy(path, settings, store, keys)
     check_inflow(anatomy, settings.flow)
-    implants, failures = deploy_all(anatomy, settings, ledger, source)
+    implants, failures = deploy_all(anatomy, settings, store, keys)
     told = provenance(path, source, settings)
     has_former = replaces and is_of_another(out, told)
-    _settle(path, out, source, ledger)
+    _settle(path, out, source, store)
     note_begun(out, settings)
     if has_former:
         take_away_study(out, engine_folders(out, settings).values())
     (out / CRATE).unlink(missing_ok=True)  # it describes files that this run replaces
     write_anatomy(out, anatomy)
     for treatment in settings.treatments:
-        keys, deployed = implant_keys(source, settings, treatment), implants.get(treatment.name, {})
-        for implant in treatment.implants if deployed else ():
-            folder = implant_folder(out, treatment.name, implant.id)
-            write = partial(write_implant, folder, deployed[implant.id])
-            write_once(ledger, f"struts {stage_name(treatment, implant)}", keys[implant.id], folder, IMPLANT, write)
-    fields, unflown = compute_flows(out, anatomy, implants, settings, ledger, source)
+        for implant in treatment.implants if treatment.name in implants else ():
+            folder, name = implant_folder(out, treatment.name, implant.id), stage_name(treatment, implant)
+            key = key_of("vstent.study.outputs:write_implant", keys[f"deploy {name}"])
+            write = partial(write_implant, folder, implants[treatment.name][implant.id])
+            store.write_once(f"struts {name}", key, folder, IMPLANT, write)
+    fields, unflown = compute_flows(out, anatomy, implants, settings, store, keys)
     failures |= unflown
-    varied = vary_all(anatomy, implants, settings, ledger, source)
-    found = Computed(anatomy, implants, fields, ledger.stored("vessel", vessel_key(source, settings), Vessel))
+    varied = vary_all(anatomy, implants, settings, store, keys)
+    found = Computed(anatomy, implants, fields, store.peek(VESSEL, keys[VESSEL], Vessel))
 
     def measures() -> dict[str, Any]:
         progress(Progress("measure", 0.0, computed=found))
-        return _measures(anatomy, implants, fields, settings, varied, failures)
+        return measure_study(anatomy, implants, fields, settings, varied, failures)
 
-    metrics = compute_once(ledger, "measure", key_of(code_key(), told, failures), measures)
-    add_measures(metrics, kept_measures(out, source, settings) if fields else {})
+    metrics = store.compute_once("measure", measures_key(settings, keys, failures), measures)
+    add_measures(metrics, kept_measures(out, keys) if fields else {})
     writers.write_json(out / METRICS, metrics)
-    told[SECONDS] = ledger.seconds
+    told[SECONDS] = store.seconds
     writers.write_json(out / RUN, told, is_exact=True)
     of_flows = (f"Flow, {name}: {field.advice}" for name, field in fields.items())
     of_failures = (f"{name}: {sentence}" for name, sentence in failures.items())
     notes = (*of_failures, *anatomy.vessel.notes, *anatomy.notes, *of_flows)
     return CaseResult(
-        **vars(found), name=out.resolve().name, metrics=metrics, provenance=told, failures=failures, notes=notes
+        **vars(found),
+        name=out.resolve().name,
+        metrics=metrics,
+        provenance=told,
+        failures=failures,
+        notes=notes,
+        keys=keys,
     )
-
-
-def _measures(
-    anatomy: Anatomy,
-    implants: Implants,
-    fields: Mapping[str, FlowField],
-    settings: Settings,
-    varied: Mapping[str, Any],
-    failures: Mapping[str, str],
-) -> dict[str, Any]:
-    """Return all metrics of a study: of vessel, implants and flows, with bands, uncertainties and failures."""
-    metrics = measure_all(anatomy, implants, fields, settings.flow)
-    band_all(anatomy, implants, metrics, settings)
-    for name, spread in varied.items():
-        metrics["treatments"][name]["uncertainty"] = spread
-    return metrics | ({"failures": dict(failures)} if failures else {})
 
 
 @claiming
@@ -172,11 +160,11 @@ def trace_vessel(path: Path, out: Path, settings: Settings, progress: OnProgress
     FolderError
         Another process uses the folder, or it cannot be written.
     """
-    ledger = Ledger(out / CACHE, progress)
+    store = Store(out / CACHE, progress)
     source = hash_of(path)
     _refuse_loss(out, source, settings, replaces)
-    vessel = find_vessel(path, source, settings, ledger)
-    _settle(path, out, source, ledger)
+    vessel = find_vessel(path, settings, store, anatomy_keys(source, settings))
+    _settle(path, out, source, store)
     write_vessel(out, vessel)
     return vessel
 
@@ -211,12 +199,12 @@ def restore_vessel(
     FolderError
         Another process uses the folder, or it cannot be written.
     """
-    ledger = Ledger(out / CACHE, progress)
+    store = Store(out / CACHE, progress)
     source = hash_of(path)
     _refuse_loss(out, source, settings, replaces)
-    anatomy = find_anatomy(path, source, settings, ledger)
+    anatomy = find_anatomy(path, settings, store, anatomy_keys(source, settings))
     measures = morphology(anatomy)
-    _settle(path, out, source, ledger)
+    _settle(path, out, source, store)
     write_anatomy(out, anatomy)
     writers.write_json(out / "morphology.json", measures)
     return anatomy, measures
@@ -245,13 +233,13 @@ def refine_flow(
     FolderError
         Another process uses the folder, or it cannot be written.
     """
-    ledger = Ledger(out / CACHE, progress)
+    store = Store(out / CACHE, progress)
     source = hash_of(path)
     _refuse_loss(out, source, settings, replaces)
-    anatomy = find_anatomy(path, source, settings, ledger)
+    anatomy = find_anatomy(path, settings, store, anatomy_keys(source, settings))
     check_inflow(anatomy, settings.flow)
-    _settle(path, out, source, ledger)
-    found = refine(out, anatomy, settings, ledger)
+    _settle(path, out, source, store)
+    found = refine(out, anatomy, settings, store)
     kept = {one.name: asdict(one) for one in found.refinements}
     kept["grid_position"] = {key: asdict(one) for key, one in found.positions.items()}
     writers.write_json(out / "convergence.json", kept)
@@ -265,12 +253,12 @@ def _refuse_loss(out: Path, source: str, settings: Settings, replaces: bool) -> 
         refuse_other_anatomy(out, settings)
 
 
-def _settle(path: Path, out: Path, source: str, ledger: Ledger) -> None:
+def _settle(path: Path, out: Path, source: str, store: Store) -> None:
     """Store the results held in memory, and remove results of another input or of a replaced anatomy."""
     former = former_source(out)
     if former not in (source, None):
         take_away_results(out)
-    elif former is not None and ledger.is_held(ANATOMY):
+    elif former is not None and store.is_held(ANATOMY):
         take_away_measures(out)
-    ledger.settle()
-    writers.write_json(out / CACHE / INPUT, {"path": str(path.resolve()), "sha256": source})
+    writers.write_json(out / CACHE / INPUT, {"layout": LAYOUT, "path": str(path.resolve()), "sha256": source})
+    store.settle()

@@ -9,17 +9,14 @@ from typing import Any, Final
 
 from vstent.devices.catalogue import find_design
 from vstent.flow.lattice.gpu import gpu_name
-from vstent.study.ledger import key_of
+from vstent.study.folder import LAYOUT
+from vstent.study.store import digest
 from vstent.study.types import Settings
 
 PACKAGES: Final = ("vstent", "numpy", "scipy", "numba", "vtk", "SimpleITK", "pydicom")
 """Packages whose versions are recorded."""
-INPUT: Final = "input.json"
-"""File in the cache folder with the path of the input; not for sharing, because the path may name the patient."""
 METRICS: Final = "metrics.json"
 """File of the case folder with all metrics."""
-RUN: Final = "run.json"
-"""File of the case folder with the provenance of the run."""
 
 
 def provenance(path: Path, source: str, settings: Settings) -> dict[str, Any]:
@@ -37,6 +34,7 @@ def provenance(path: Path, source: str, settings: Settings) -> dict[str, Any]:
         Versions, machine, devices, input with its hash, and settings.
     """
     return {
+        "layout": LAYOUT,
         "versions": versions(),
         "machine": machine(settings),
         "devices": devices_of(settings.devices),
@@ -59,4 +57,4 @@ def machine(settings: Settings) -> dict[str, str]:
 
 def devices_of(names: Iterable[str]) -> dict[str, str]:
     """Return a digest of the catalogue data of every device, because a catalogue can change."""
-    return {name: key_of(find_design(name)) for name in names}
+    return {name: digest(find_design(name)) for name in names}

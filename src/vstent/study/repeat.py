@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 from vstent.errors import InputError, ReadError
 from vstent.io.files import existing
-from vstent.study.folder import CACHE
-from vstent.study.ledger import hash_of
-from vstent.study.provenance import INPUT, METRICS, RUN, devices_of, machine, versions
+from vstent.study.folder import CACHE, INPUT, LAYOUT, RUN
+from vstent.study.keys import hash_of
+from vstent.study.provenance import METRICS, devices_of, machine, versions
+from vstent.study.store import UNREADABLE
 from vstent.study.types import Settings
 
 if TYPE_CHECKING:
@@ -22,8 +23,6 @@ MISSING: Final = "absent"
 """Text for a value that a record does not state."""
 SECONDS: Final = "seconds"
 """Key of the run times of the stages, in s."""
-UNTOLD: Final = (OSError, ValueError, KeyError, TypeError)
-"""Exceptions that reading a missing, damaged or foreign file raises."""
 TOLERANCE: Final = 1e-3
 """Relative difference of metrics that another machine may cause, since processors round differently. Measured on one
 processor with and without wide and fused instructions: 2e-4 for a steady flow."""
@@ -64,7 +63,7 @@ def read_record(path: Path, moved_to: Path | None = None) -> Record:
         told, settings = told_in(existing(path))
         sha256 = str(told["input"]["sha256"])
         differences = _differences(told, settings)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except UNREADABLE:
         raise ReadError(f"{path} is not a run.json of this version: give the scan and the options again") from None
     source = moved_to or _input(path.parent)
     if not source.exists():
@@ -78,7 +77,7 @@ def _input(folder: Path) -> Path:
     """Return the recorded path of the input of a case folder."""
     try:
         return Path(json.loads((folder / CACHE / INPUT).read_text(encoding="utf-8"))["path"])
-    except UNTOLD:
+    except UNREADABLE:
         raise ReadError(
             f"{folder} does not state the place of its input (its folder {CACHE} is missing): give it with --input"
         ) from None
@@ -86,24 +85,27 @@ def _input(folder: Path) -> Path:
 
 def former_source(folder: Path) -> str | None:
     """Return the hash of the input of a case folder's results; None where it is not stated."""
-    with suppress(*UNTOLD):
+    with suppress(*UNREADABLE):
         return str(json.loads((folder / CACHE / INPUT).read_text(encoding="utf-8"))["sha256"])
-    with suppress(*UNTOLD):
+    with suppress(*UNREADABLE):
         return str(json.loads((folder / RUN).read_text(encoding="utf-8"))["input"]["sha256"])
     return None
 
 
 def is_of_another(folder: Path, told: Mapping[str, Any]) -> bool:
-    """Return whether a folder holds results of an unfinished run, or of one with another provenance than `told`."""
-    with suppress(*UNTOLD):
+    """Return whether a folder holds results of an unfinished run, or of other input or settings than `told` states."""
+    with suppress(*UNREADABLE):
         former = json.loads((folder / RUN).read_text(encoding="utf-8"))
-        return {key: former[key] for key in former if key != SECONDS} != json.loads(json.dumps(told))
+        now = json.loads(json.dumps(told))
+        return bool(former["settings"] != now["settings"] or former["input"]["sha256"] != now["input"]["sha256"])
     return former_source(folder) is not None
 
 
 def told_in(run: Path) -> tuple[dict[str, Any], Settings]:
-    """Return the content of a ``run.json`` and its settings; one of `UNTOLD` is raised where it cannot be read."""
+    """Return the content of a ``run.json`` and its settings; one of `UNREADABLE` is raised where it cannot be read."""
     told = json.loads(run.read_text(encoding="utf-8"))
+    if told["layout"] != LAYOUT:
+        raise ValueError("another layout")
     return told, settings_of(told["settings"])
 
 
@@ -124,7 +126,7 @@ def finished_run(out: Path) -> tuple[str, Settings]:
     try:
         told, study = told_in(out / RUN)
         return str(told["input"]["sha256"]), study
-    except UNTOLD:
+    except UNREADABLE:
         raise ReadError(f"{out / RUN} is from another version: run the case again") from None
 
 

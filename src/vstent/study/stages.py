@@ -1,8 +1,8 @@
-"""Stages of a study; the ledger measures and reports each of them."""
+"""Stages of a study; the store measures and reports each of them, and keeps their results."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from math import isfinite
 from pathlib import Path
@@ -32,19 +32,18 @@ from vstent.flow.indices import indices, ratios
 from vstent.flow.ostium import ostium
 from vstent.flow.problem import flow_case, vessel_case
 from vstent.flow.settings import FlowSettings
-from vstent.flow.simulation import foretell_cost, simulate_case
+from vstent.flow.simulation import OnProgress, foretell_cost, simulate_case
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.files import is_surface_file
 from vstent.io.images import read_image
 from vstent.kernels.arrays import Floats
 from vstent.plan.bands import bands
 from vstent.plan.uncertainty import Uncertainty, vary
-from vstent.study.checkpoint import FlowCheckpoint
 from vstent.study.folder import flow_folder
-from vstent.study.ledger import ANATOMY, Ledger, anatomy_key, key_of, vessel_key
+from vstent.study.keys import ANATOMY, VESSEL, stage_name
 from vstent.study.outputs import write_field
+from vstent.study.store import Key, Store, Unfinished
 from vstent.study.types import Point, Settings
-from vstent.study.written import code_key
 from vstent.units import counted
 
 SLOWEST_M_S: Final = 0.01
@@ -56,17 +55,17 @@ NEAR_MM: Final = 3.0
 """Largest distance from the vessel wall, in mm, at which another interpretation of a point is proposed."""
 
 
-def find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger) -> Anatomy:
+def find_anatomy(path: Path, settings: Settings, store: Store, keys: Mapping[str, Key]) -> Anatomy:
     """Read, segment, repair, trace, trim and restore; a result stored for this input is returned without computation.
 
-    The ledger keeps the result in memory until its `settle` stores it.
+    The store keeps the result in memory until its `settle` writes it.
 
     Parameters
     ----------
     path : a scan or a surface.
-    source : SHA-256 of the input.
     settings : settings of the study.
-    ledger : record of the study.
+    store : results of the study.
+    keys : keys of its stages, of `vstent.study.keys`.
 
     Raises
     ------
@@ -74,12 +73,11 @@ def find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger) ->
         An input or option cannot be used. Where no vessel is found at the point `at_mm`, the message proposes the same
         point in another frame or as a voxel index, if there is a vessel.
     """
-    key = anatomy_key(source, settings)
-    kept = ledger.recall(ANATOMY, key, Anatomy)
+    kept = store.find(ANATOMY, keys[ANATOMY], Anatomy)
     if kept is not None:
         return kept
     try:
-        return _find_anatomy(path, source, settings, ledger, key)
+        return _find_anatomy(path, settings, store, keys)
     except InputError as error:
         if settings.anatomy.at_mm is None or settings.anatomy.neck_mm is not None:
             raise
@@ -114,51 +112,49 @@ def _readings(path: Path, settings: Settings) -> Iterator[tuple[str, Point]]:
     yield "with the second sign changed", (x, -y, z)
 
 
-def _find_anatomy(path: Path, source: str, settings: Settings, ledger: Ledger, key: str) -> Anatomy:
+def _find_anatomy(path: Path, settings: Settings, store: Store, keys: Mapping[str, Key]) -> Anatomy:
     """Return the anatomy of an input, computed."""
-    whole = find_vessel(path, source, settings, ledger)
-    neck_mm = None if settings.anatomy.neck_mm is None else np.array(settings.anatomy.neck_mm, dtype=np.float64)
-    at_mm = _array(settings.anatomy.at_mm) if neck_mm is None else neck_mm.mean(axis=0)
-    outlet_mm = _array(settings.anatomy.outlet_mm)
+    given = settings.anatomy
+    whole = find_vessel(path, settings, store, keys)
+    neck_mm = None if given.neck_mm is None else np.array(given.neck_mm, dtype=np.float64)
+    at_mm = _array(given.at_mm) if neck_mm is None else neck_mm.mean(axis=0)
+    outlet_mm = _array(given.outlet_mm)
     if outlet_mm is not None:
         opening_at(whole, outlet_mm)  # checked before trimming, which may cut this outlet off
-    with ledger.stage("trim") as tell:
-        traced = trim(
-            whole, at_mm=at_mm, upstream_mm=settings.anatomy.upstream_mm, downstream_mm=settings.anatomy.downstream_mm
-        )
+    with store.stage("trim") as tell:
+        traced = trim(whole, at_mm=at_mm, upstream_mm=given.upstream_mm, downstream_mm=given.downstream_mm)
         tell(" ".join(traced.notes[len(whole.notes) :]))
-    with ledger.stage("restore") as tell:
-        anatomy = restore(traced, at_mm=_array(settings.anatomy.at_mm), outlet_mm=outlet_mm, neck_mm=neck_mm)
+    with store.stage("restore") as tell:
+        anatomy = restore(traced, at_mm=_array(given.at_mm), outlet_mm=outlet_mm, neck_mm=neck_mm)
         tell(" ".join([*anatomy.notes, *(f"Sac volume {a.sac.volume_mm3:.0f} mm3." for a in anatomy.aneurysms)]))
-    ledger.hold(ANATOMY, key, anatomy)
+    store.hold(ANATOMY, keys[ANATOMY], anatomy)
     return anatomy
 
 
-def find_vessel(path: Path, source: str, settings: Settings, ledger: Ledger) -> Vessel:
+def find_vessel(path: Path, settings: Settings, store: Store, keys: Mapping[str, Key]) -> Vessel:
     """Read, segment, repair and trace; a result stored for this input is returned without computation.
 
-    The ledger keeps the result in memory until its `settle` stores it.
+    The store keeps the result in memory until its `settle` writes it.
 
     Parameters
     ----------
     path : a scan or a surface.
-    source : SHA-256 of the input.
     settings : settings of the study.
-    ledger : record of the study.
+    store : results of the study.
+    keys : keys of its stages, of `vstent.study.keys`.
     """
-    key = vessel_key(source, settings)
-    kept = ledger.recall("vessel", key, Vessel)
+    kept = store.find(VESSEL, keys[VESSEL], Vessel)
     if kept is not None:
         return kept
-    with ledger.stage("segment") as tell:
+    with store.stage("segment") as tell:
         vessel = _vessel(path, settings)
         tell(" ".join(vessel.notes))
-    with ledger.stage("trace") as tell:
+    with store.stage("trace") as tell:
         traced = trace(vessel, inlet_mm=_array(settings.anatomy.inlet_mm))
         widths = ", ".join(f"{inlet.role} {inlet.diameter_mm:.1f} mm wide" for inlet in traced.inlets)
         found = f"{counted(len(traced.outlets), 'outlet')}; {widths}."
         tell(" ".join([found, *traced.notes[len(vessel.notes) :]]))
-    ledger.hold("vessel", key, traced)
+    store.hold(VESSEL, keys[VESSEL], traced)
     return traced
 
 
@@ -171,7 +167,7 @@ def _vessel(path: Path, settings: Settings) -> Vessel:
 
 
 def deploy_all(
-    anatomy: Anatomy, settings: Settings, ledger: Ledger, source: str
+    anatomy: Anatomy, settings: Settings, store: Store, keys: Mapping[str, Key]
 ) -> tuple[dict[str, dict[str, Deployment]], dict[str, str]]:
     """Deploy the implants of every treatment in the given or the proposed sizes; stored ones are not computed again.
 
@@ -179,8 +175,8 @@ def deploy_all(
     ----------
     anatomy : vessel, sacs and paths.
     settings : settings of the study.
-    ledger : record of the study; it keeps new deployments in memory until its `settle` stores them.
-    source : SHA-256 of the input.
+    store : results of the study; it keeps new deployments in memory until its `settle` writes them.
+    keys : keys of its stages.
 
     Returns
     -------
@@ -198,53 +194,30 @@ def deploy_all(
     failures: dict[str, str] = {}
     for treatment in settings.treatments:
         try:
-            found[treatment.name] = _deployed(treatment, anatomy, settings, ledger, source)
+            found[treatment.name] = _deployed(treatment, anatomy, store, keys)
         except (DeviceError, LandingError) as error:
             if len(failures) + 1 == len(settings.treatments):  # the last one too
                 raise
             failures[treatment.name] = f"not deployed: {error}"
-            ledger.progress(f"deploy {treatment.name}", 1.0, failures[treatment.name])
+            store.progress(f"deploy {treatment.name}", 1.0, failures[treatment.name])
     return found, failures
 
 
 def _deployed(
-    treatment: Treatment, anatomy: Anatomy, settings: Settings, ledger: Ledger, source: str
+    treatment: Treatment, anatomy: Anatomy, store: Store, keys: Mapping[str, Key]
 ) -> dict[str, Deployment]:
     """Return the deployed implants of a treatment by id, each stored or computed."""
     found: dict[str, Deployment] = {}
-    keys = implant_keys(source, settings, treatment)
     for implant in treatment.implants:
         stage = f"deploy {stage_name(treatment, implant)}"
-        deployment = ledger.recall(stage, keys[implant.id], Deployment)
+        deployment = store.find(stage, keys[stage], Deployment)
         if deployment is None:
-            with ledger.stage(stage) as tell:
+            with store.stage(stage) as tell:
                 deployment = deploy_implant(implant, anatomy, [found[name].stent for name in implant.inside])
                 tell(deployment.advice)
-            ledger.hold(stage, keys[implant.id], deployment)
+            store.hold(stage, keys[stage], deployment)
         found[implant.id] = deployment
     return found
-
-
-def stage_name(treatment: Treatment, implant: Implant) -> str:
-    """Return the name of an implant in names of stages: that of its treatment, and its own beside others."""
-    return treatment.name if len(treatment.implants) == 1 else f"{treatment.name} {implant.id}"
-
-
-def implant_keys(source: str, settings: Settings, treatment: Treatment) -> dict[str, str]:
-    """Return the keys of the deployments of a treatment by the implants' ids.
-
-    Parameters
-    ----------
-    source : SHA-256 of the input.
-    settings : settings of the study.
-    treatment : the treatment.
-    """
-    keys: dict[str, str] = {}
-    for implant in treatment.implants:
-        given = find_design(implant.device), implant.diameter_mm, implant.length_mm, implant.placing
-        inside = [keys[name] for name in implant.inside]
-        keys[implant.id] = key_of(code_key(), anatomy_key(source, settings), *given, inside)
-    return keys
 
 
 def deploy_implant(implant: Implant, anatomy: Anatomy, inside: Sequence[Stent] = ()) -> Deployment:
@@ -352,8 +325,8 @@ def compute_flows(
     anatomy: Anatomy,
     implants: Mapping[str, Mapping[str, Deployment]],
     settings: Settings,
-    ledger: Ledger,
-    source: str,
+    store: Store,
+    keys: Mapping[str, Key],
 ) -> tuple[dict[str, FlowField], dict[str, str]]:
     """Compute the flow in the bare artery and with every treatment; each is stored as soon as it is finished.
 
@@ -365,8 +338,8 @@ def compute_flows(
     anatomy : vessel, sacs and paths.
     implants : deployed implants by treatment and id.
     settings : settings of the study.
-    ledger : record of the study.
-    source : SHA-256 of the input.
+    store : results of the study.
+    keys : keys of its stages.
 
     Returns
     -------
@@ -386,63 +359,74 @@ def compute_flows(
     failures: dict[str, str] = {}
     folders, stored = engine_folders(out, settings), []
     stents = {BARE: [], **{name: [one.stent for one in found.values()] for name, found in implants.items()}}
+    names = (BARE, *(one.name for one in settings.treatments if one.has_flow and one.name in implants))
     with Beside(settings.flow.numerics) as beside:
-        for name, key in flow_keys(source, settings).items():
-            if name not in stents:
-                continue  # it could not be deployed
-            stage = f"flow {name}"
-            field, store = ledger.recall(stage, key, FlowField), None
+        for name in names:
+            stage, keep = f"flow {name}", None
+            field = store.find(stage, keys[stage], FlowField)
             if field is None:
                 if name == BARE:
-                    _plan(anatomy, stents, settings.flow, ledger)
+                    _plan(anatomy, stents, settings.flow, store)
                 try:
-                    with ledger.stage(stage) as tell:
-                        field = simulate_case(
-                            flow_case(anatomy, stents[name], settings.flow),
+                    with store.stage(stage) as tell:
+                        field = compute_flow(
+                            anatomy,
+                            stents[name],
+                            settings.flow,
                             start=fields.get(BARE),
                             folder=folders[name],
-                            progress=ledger.teller(stage),
-                            checkpoint=FlowCheckpoint(ledger.folder, stage, key),
+                            progress=store.teller(stage),
+                            unfinished=store.unfinished(stage, keys[stage]),
                         )
                         tell(field.advice)
                 except FlowError as error:
                     if name == BARE:
                         raise
                     failures[name] = f"flow not computed: {error}"
-                    ledger.progress(stage, 1.0, failures[name])
+                    store.progress(stage, 1.0, failures[name])
                     continue
-                store = ledger.keeping(stage, key, field)
+                keep = store.keeping(stage, keys[stage], field)
             fields[name] = field
-            stored.append(beside.do(partial(_store, store, flow_folder(out, name), field)))
+            stored.append(beside.do(partial(_keep, keep, flow_folder(out, name), field)))
     for done in stored:
         done()
     return fields, failures
 
 
-def _store(store: Callable[[], None] | None, folder: Path, field: FlowField) -> None:
-    """Store a flow in the ledger, unless it was read from there, and write its files."""
-    if store is not None:
-        store()
+def _keep(keep: Callable[[], None] | None, folder: Path, field: FlowField) -> None:
+    """Store a flow, unless it was read from the store, and write its files."""
+    if keep is not None:
+        keep()
     write_field(folder, field)
 
 
-def flow_keys(source: str, settings: Settings) -> dict[str, str]:
-    """Return the keys of the flows of a study by treatment, ``bare`` first.
+def compute_flow(
+    anatomy: Anatomy,
+    stents: Sequence[Stent],
+    settings: FlowSettings,
+    *,
+    start: FlowField | None,
+    folder: Path,
+    progress: OnProgress,
+    unfinished: Unfinished,
+) -> FlowField:
+    """Compute one flow; an unfinished one resumes.
 
     Parameters
     ----------
-    source : SHA-256 of the input.
-    settings : settings of the study.
+    anatomy : vessel, sacs and paths.
+    stents : the deployed implants of the treatment; none in the bare artery.
+    settings : settings of the flow.
+    start : the flow in the bare artery, where it is known.
+    folder : folder of the engine's own files.
+    progress : called at every check.
+    unfinished : saved states of its runs.
     """
-    wanted = [treatment for treatment in settings.treatments if treatment.has_flow]
-    anatomy = anatomy_key(source, settings)
-    return {
-        one.name: key_of(anatomy, settings.flow, *implant_keys(source, settings, one).values())
-        for one in (Treatment(BARE), *wanted)
-    }
+    case = flow_case(anatomy, stents, settings)
+    return simulate_case(case, start=start, folder=folder, progress=progress, checkpoint=unfinished)
 
 
-def refine(out: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> Sensitivity:
+def refine(out: Path, anatomy: Anatomy, settings: Settings, store: Store) -> Sensitivity:
     """Compute the flow without a device on three grids, with three time steps and in three positions on the grid.
 
     Parameters
@@ -450,16 +434,16 @@ def refine(out: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> S
     out : the case folder.
     anatomy : vessel, parent artery and sacs.
     settings : settings of the study; the grid spacing is that of the finest grid.
-    ledger : record of the study.
+    store : results of the study.
     """
     flow = settings.flow or FlowSettings()
-    _plan(anatomy, {}, flow, ledger)
-    with ledger.stage("convergence") as tell:
+    _plan(anatomy, {}, flow, store)
+    with store.stage("convergence") as tell:
         done: list[str] = []
 
         def told(fraction: float, sentence: str) -> None:
             done.append(sentence)
-            ledger.progress("convergence", 0.99 * fraction, sentence)
+            store.progress("convergence", 0.99 * fraction, sentence)
 
         folder = out / "convergence" / flow.numerics.engine
         found = convergence(flow_case(anatomy, (), flow), folder=folder, told=told)
@@ -467,9 +451,9 @@ def refine(out: Path, anatomy: Anatomy, settings: Settings, ledger: Ledger) -> S
     return found
 
 
-def _plan(anatomy: Anatomy, stents: Mapping[str, Sequence[Stent]], settings: FlowSettings, ledger: Ledger) -> None:
+def _plan(anatomy: Anatomy, stents: Mapping[str, Sequence[Stent]], settings: FlowSettings, store: Store) -> None:
     """Report run time and memory of the flows by treatment; an error is raised where one does not fit in the memory."""
-    with ledger.stage("plan flow") as tell:
+    with store.stage("plan flow") as tell:
         costs = {name: foretell_cost(flow_case(anatomy, found, settings)) for name, found in stents.items()}
         said = costs.pop(BARE)
         tell(" ".join([said, *(f"With {name}, {cost}" for name, cost in costs.items() if cost != said)]))
@@ -479,8 +463,8 @@ def vary_all(
     anatomy: Anatomy,
     implants: Mapping[str, Mapping[str, Deployment]],
     settings: Settings,
-    ledger: Ledger,
-    source: str,
+    store: Store,
+    keys: Mapping[str, Key],
 ) -> dict[str, dict[str, Any]]:
     """Vary the uncertain inputs of every treatment with one implant.
 
@@ -489,8 +473,8 @@ def vary_all(
     anatomy : vessel, sacs and paths.
     implants : deployed implants by treatment and id.
     settings : settings of the study.
-    ledger : record of the study.
-    source : SHA-256 of the input.
+    store : results of the study.
+    keys : keys of its stages.
 
     Returns
     -------
@@ -505,25 +489,48 @@ def vary_all(
         if len(implants.get(treatment.name, ())) != 1:
             continue
         (deployment,) = implants[treatment.name].values()
-        (implant_key,) = implant_keys(source, settings, treatment).values()
         stage = f"vary {treatment.name}"
-        numbers = [asdict(one) for one in settings.uncertainty.numbers_of(deployment.stent.design)]
-        key = key_of(implant_key, settings.uncertainty, flow, numbers)
-        varied = ledger.recall(stage, key, Uncertainty)
+        varied = store.find(stage, keys[stage], Uncertainty)
         if varied is None:
-            with ledger.stage(stage) as tell:
-                told = partial(_tell_count, ledger, stage)
-                begun = FlowCheckpoint(ledger.folder, stage, key)
+            with store.stage(stage) as tell:
+                told = partial(_tell_count, store, stage)
+                begun = store.unfinished(stage, keys[stage])
                 varied = vary(anatomy, deployment, settings.uncertainty, flow=flow, progress=told, checkpoint=begun)
                 tell(f"{len(varied.points)} deployments; {varied.n_failed} of them did not fit.")
-            ledger.keep(stage, key, varied)
+            store.keep(stage, keys[stage], varied)
         found[treatment.name] = varied.metrics()
     return found
 
 
-def _tell_count(ledger: Ledger, stage: str, done: int, total: int) -> None:
+def _tell_count(store: Store, stage: str, done: int, total: int) -> None:
     """Report that `done` of `total` deployments of a stage are finished."""
-    ledger.progress(stage, 0.99 * done / total, f"{done} of {total}")
+    store.progress(stage, 0.99 * done / total, f"{done} of {total}")
+
+
+def measure_study(
+    anatomy: Anatomy,
+    deployments: Mapping[str, Deployment],
+    fields: Mapping[str, FlowField],
+    settings: Settings,
+    varied: Mapping[str, Any],
+    failures: Mapping[str, str],
+) -> dict[str, Any]:
+    """Return all metrics of a study: of vessel, devices and flows, with bands, uncertainties and failures.
+
+    Parameters
+    ----------
+    anatomy : vessel, parent artery and sacs.
+    deployments : deployments by device name.
+    fields : flows by name, ``bare`` first.
+    settings : settings of the study.
+    varied : uncertainty metrics by device name.
+    failures : reasons why a device was not deployed or its flow not computed, by name.
+    """
+    metrics = measure_all(anatomy, deployments, fields, settings.flow)
+    band_all(anatomy, deployments, metrics, settings)
+    for name, spread in varied.items():
+        metrics["stents"][name]["uncertainty"] = spread
+    return metrics | ({"failures": dict(failures)} if failures else {})
 
 
 def measure_all(

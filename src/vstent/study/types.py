@@ -11,6 +11,7 @@ from vstent.flow.case import FlowField
 from vstent.flow.settings import FlowSettings
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.plan.uncertainty import Ranges
+from vstent.study.store import Key
 
 Point = tuple[float, float, float]
 """Three lengths in mm: a point or voxel edges."""
@@ -131,3 +132,5 @@ class CaseResult(Computed):
     """Reason why a treatment was not deployed or its flow not computed, by treatment."""
     notes: tuple[str, ...]
     """Findings, assumptions and repairs, and the reliability of every flow, one sentence each."""
+    keys: "dict[str, Key]"
+    """Keys of the stages by name."""

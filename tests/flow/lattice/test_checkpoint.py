@@ -21,7 +21,7 @@ from vstent.flow.settings import FlowSettings, Numerics, Waveform
 from vstent.flow.simulation import simulate_case
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Vessel
-from vstent.study.checkpoint import FlowCheckpoint
+from vstent.study.store import Unfinished
 
 SETTINGS = FlowSettings(inflow_mL_s=2.0, numerics=Numerics(cell_size_mm=0.3, max_steps=800))
 PULSE = FlowSettings(
@@ -45,7 +45,7 @@ def screen() -> Sheet:
     return Sheet(points, normals, 0.01 * one, 300 * one, 150 * one, 0 * one, one, one)
 
 
-class Stopping(FlowCheckpoint):
+class Stopping(Unfinished):
     """Stops the run right after it has been saved for the `last` time."""
 
     last = 3
@@ -80,7 +80,7 @@ def test_a_stopped_flow_goes_on_to_the_same_bits(
     stopping.last = saves
     with pytest.raises(KeyboardInterrupt):
         simulate_case(case, start=start, checkpoint=stopping)
-    resumed = simulate_case(case, start=start, checkpoint=FlowCheckpoint(tmp_path, "flow", "key"))
+    resumed = simulate_case(case, start=start, checkpoint=Unfinished(tmp_path, "flow-key"))
     assert_same(resumed, whole)
 
 
@@ -103,7 +103,7 @@ sys.path.insert(0, {str(Path(__file__).parent)!r})
 import test_checkpoint as here
 here.engines.SAVE_EVERY_S = 0.05
 case = here.vessel_case(here.vessel(), here.LONG)
-here.simulate_case(case, checkpoint=here.FlowCheckpoint(Path(sys.argv[1]), "flow", "key"))
+here.simulate_case(case, checkpoint=here.Unfinished(Path(sys.argv[1]), "flow-key"))
 """
 LONG = FlowSettings(inflow_mL_s=2.0, numerics=Numerics(cell_size_mm=0.3, max_steps=1600, tolerance=1e-9))
 
@@ -121,16 +121,16 @@ def test_a_killed_flow_goes_on_to_the_same_bits(tmp_path: Path) -> None:
         process.kill()
         process.wait()
     case = vessel_case(vessel(), LONG)
-    resumed = simulate_case(case, checkpoint=FlowCheckpoint(tmp_path, "flow", "key"))
+    resumed = simulate_case(case, checkpoint=Unfinished(tmp_path, "flow-key"))
     assert_same(resumed, simulate_case(case))
 
 
 def test_what_is_damaged_or_was_never_saved_is_begun_anew(tmp_path: Path) -> None:
-    kept = FlowCheckpoint(tmp_path, "flow", "key")
+    kept = Unfinished(tmp_path, "flow-key")
     assert kept.load("answer") is None
     kept.save("answer", {"steps": np.array(7)})
     assert kept.load("answer") == {"steps": 7}
     file = next(tmp_path.iterdir())
     file.write_bytes(file.read_bytes()[:-40])
     assert kept.load("answer") is None
-    assert FlowCheckpoint(tmp_path, "flow", "other").load("answer") is None
+    assert Unfinished(tmp_path, "flow-other").load("answer") is None

@@ -30,10 +30,10 @@ CLEAR: Final = 1.9
 CLEAR_EDGES: Final = 1.5
 """The flank is used only above this height, in edge lengths of the mesh: the mesh cuts off the bottom of the
 crevice."""
-UNTOLD_MM: Final = 0.5
+UNREADABLE_MM: Final = 0.5
 """Height in mm above which the flank is used where the blur is unknown: 1.9 times 0.26 mm, the total blur of 3DRA scans
 from voxel size, reconstruction and mesh smoothing."""
-UNTOLD_EDGES: Final = 2.2
+UNREADABLE_EDGES: Final = 2.2
 """The same height in edge lengths of the mesh; the larger one applies. An iso-surface has edges of 0.9 voxel, and the
 blur of a scan is about one voxel."""
 DEEPEST: Final = 0.45
@@ -217,7 +217,7 @@ def believed_from_mm(lumen: Surface, foot_mm: Floats, most_mm: float, blur_mm: f
     corners = lumen.corners_mm[near[lumen.faces].any(axis=1)]
     edge_mm = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
     if blur_mm is None:
-        return min(max(UNTOLD_MM, UNTOLD_EDGES * edge_mm), most_mm)
+        return min(max(UNREADABLE_MM, UNREADABLE_EDGES * edge_mm), most_mm)
     return min(max(CLEAR * blur_mm, CLEAR_EDGES * edge_mm), most_mm)
 
 

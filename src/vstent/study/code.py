@@ -1,0 +1,144 @@
+"""Digest of the code that computes a result: the syntax trees of the modules that a function imports.
+
+Comments, docstrings, formatting, annotations of functions, and dates of files do not change it.
+"""
+
+import ast
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
+
+from vstent.io.files import atomic
+from vstent.io.states import state_of
+from vstent.kernels.cache import kept_in
+from vstent.study.store import UNREADABLE, digest
+
+PACKAGE: Final = Path(__file__).parents[1]
+"""Folder of the package."""
+REMEMBERED: Final = "vstent.code.json"
+"""File beside the compiled kernels with the digests of files, which are read again only if size or date has changed."""
+_BY_NAME: Final = "vstent.study"
+"""Package of which only the functions count that are used, not whole modules: it orders and stores the stages."""
+
+
+@cache
+def code_of(entry: str, without: tuple[str, ...] = ()) -> str:
+    """Return the digest of the code that a module or a function needs.
+
+    Imports inside functions count, imports for types only do not.
+
+    Parameters
+    ----------
+    entry : a module, or ``module:function``.
+    without : prefixes of modules that do not count, because the result does not use them.
+    """
+    todo, found, memory = [entry], dict[str, str](), _memory()
+    is_new = False
+    while todo:
+        name = todo.pop()
+        if name in found or name.startswith(without or "-"):
+            continue
+        file = _file_of(name)
+        state = [sys.version, state_of(file), state_of(Path(__file__))]
+        if memory.get(name, [None])[0] != state:
+            memory[name], is_new = [state, *_read(file, name.partition(":")[2])], True
+        _, found[name], imports = memory[name]
+        todo += imports
+    if is_new:
+        with suppress(OSError), atomic(kept_in(PACKAGE) / REMEMBERED) as partial:
+            partial.write_text(json.dumps(memory))
+    return digest(sorted(found.items()))
+
+
+@cache
+def _memory() -> dict[str, list[Any]]:
+    """Return what is remembered of modules and functions by name: state of the file, digest and imports."""
+    with suppress(*UNREADABLE):
+        found = json.loads((kept_in(PACKAGE) / REMEMBERED).read_text())
+        return {str(name): [state, str(tree), list(imports)] for name, (state, tree, imports) in found.items()}
+    return {}
+
+
+def _file_of(name: str) -> Path:
+    """Return the file of a module of vstent."""
+    folder = PACKAGE.joinpath(*name.partition(":")[0].split(".")[1:])
+    return folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")
+
+
+def _read(file: Path, function: str) -> tuple[str, list[str]]:
+    """Return the digest of a file and its imports; of a function there with all that it uses where one is named."""
+    tree = ast.parse(file.read_bytes())
+    for node in ast.walk(tree):
+        if isinstance(node, ast.arg):
+            node.annotation = None
+        elif isinstance(node, ast.FunctionDef):
+            node.returns = None
+        for name, value in ast.iter_fields(node):
+            if isinstance(value, list):
+                setattr(node, name, [one for one in value if not _is_silent(one)])
+    statements = _used(tree.body, function) if function else tree.body
+    imports = {name for one in statements for node in ast.walk(one) for name in _imports(node)}
+    parts: list[str] = []
+    for one in statements:
+        _describe(one, parts)
+    return digest(parts), sorted(imports)
+
+
+def _is_silent(node: object) -> bool:
+    """Return whether a statement changes no result: a docstring, or a block for types only."""
+    if isinstance(node, ast.Expr):
+        return isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+    return isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+
+
+def _describe(value: object, parts: list[str]) -> None:
+    """Append the description of a syntax tree without positions, the same in every version of Python."""
+    if isinstance(value, ast.AST):
+        parts.append(type(value).__name__)
+        for name in value._fields:
+            item = getattr(value, name, None)
+            if item is not None and item != []:
+                parts.append(name)
+                _describe(item, parts)
+    elif isinstance(value, list):
+        parts.append(str(len(value)))
+        for item in value:
+            _describe(item, parts)
+    else:
+        parts.append(repr(value))
+
+
+def _used(statements: list[ast.stmt], function: str) -> list[ast.stmt]:
+    """Return the statements of a module that a function there needs; of imports only the names that it uses."""
+    owners = dict[str, ast.stmt]()
+    for one in statements:
+        if isinstance(one, ast.ImportFrom):
+            owners |= {name.asname or name.name: ast.ImportFrom(one.module, [name], 0) for name in one.names}
+        elif isinstance(one, (ast.FunctionDef, ast.ClassDef)):
+            owners[one.name] = one
+        else:
+            owners |= {to.id: one for to in ast.walk(one) if isinstance(to, ast.Name) and isinstance(to.ctx, ast.Store)}
+    todo, found = [function], dict[str, ast.stmt]()
+    while todo:
+        name = todo.pop()
+        if name in owners and name not in found:
+            found[name] = owners[name]
+            todo += [node.id for node in ast.walk(owners[name]) if isinstance(node, ast.Name)]
+    return [found[name] for name in sorted(found)]
+
+
+def _imports(node: ast.AST) -> Iterator[str]:
+    """Yield the modules of vstent that a statement imports; of the package `_BY_NAME` the functions."""
+    if isinstance(node, ast.Import):
+        yield from (name.name for name in node.names if name.name.startswith("vstent."))
+    elif isinstance(node, ast.ImportFrom) and str(node.module).partition(".")[0] == "vstent":
+        for name in node.names:
+            inner = f"{node.module}.{name.name}"
+            if _file_of(inner).is_file():
+                yield inner
+            else:
+                yield f"{node.module}:{name.name}" if str(node.module).startswith(_BY_NAME) else str(node.module)

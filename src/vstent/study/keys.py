@@ -1,0 +1,183 @@
+"""Keys of the results of a study: each states what a result is computed from, code included.
+
+A key contains the keys of the results that are used, the settings of the stage, and the code of the stage's function
+(`vstent.study.code`). A changed line therefore changes the keys of its own stage and of all that follow from it.
+"""
+
+import hashlib
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from vstent.devices.catalogue import find_design
+from vstent.devices.treatment import BARE, Implant, Treatment
+from vstent.errors import ReadError
+from vstent.flow.settings import LATTICE
+from vstent.io.images import files_of
+from vstent.study.code import code_of
+from vstent.study.store import Key, digest
+
+if TYPE_CHECKING:
+    from vstent.angiography.angiogram import AngiogramSettings
+    from vstent.devices.design import Design
+    from vstent.flow.settings import FlowSettings
+    from vstent.study.types import Settings
+
+ANATOMY: Final = "anatomy"
+"""Name of the anatomy in the store."""
+VESSEL: Final = "vessel"
+"""Name of the vessel before it is trimmed in the store."""
+
+def key_of(entry: str, *parts: Any, without: tuple[str, ...] = ()) -> Key:
+    """Return the key of a result.
+
+    Parameters
+    ----------
+    entry : module or function (``module:function``) that computes it.
+    parts : all that it depends on: keys of other results, settings and other plain values.
+    without : prefixes of modules that it does not use.
+    """
+    return Key(digest(parts), digest([code_of(entry, without), *(key.code for key in _keys_in(parts))]))
+
+
+def _keys_in(parts: Any) -> Iterator[Key]:
+    """Yield the keys among values."""
+    if isinstance(parts, Key):
+        yield parts
+    elif isinstance(parts, (tuple, list)):
+        for part in parts:
+            yield from _keys_in(part)
+
+
+def anatomy_keys(source: str, settings: "Settings") -> dict[str, Key]:
+    """Return the keys of the vessel and the anatomy of an input, by name.
+
+    Parameters
+    ----------
+    source : SHA-256 of the input.
+    settings : settings of the study.
+    """
+    given = settings.anatomy
+    vessel = key_of("vstent.study.stages:find_vessel", source, settings.input, given.at_mm, given.inlet_mm)
+    return {VESSEL: vessel, ANATOMY: key_of("vstent.study.stages:find_anatomy", vessel, given)}
+
+
+def stage_name(treatment: Treatment, implant: Implant) -> str:
+    """Return the name of an implant in names of stages: that of its treatment, and its own beside others."""
+    return treatment.name if len(treatment.implants) == 1 else f"{treatment.name} {implant.id}"
+
+
+def implant_keys(anatomy: Key, treatment: Treatment) -> dict[str, Key]:
+    """Return the keys of the deployments of a treatment by the implants' ids.
+
+    Ranges and sources of the numbers of a device do not change them.
+    """
+    keys: dict[str, Key] = {}
+    for implant in treatment.implants:
+        design = replace(find_design(implant.device), facts=(), ranges=())
+        given = design, implant.diameter_mm, implant.length_mm, implant.placing
+        inside = [keys[name] for name in implant.inside]
+        keys[implant.id] = key_of("vstent.study.stages:deploy_implant", anatomy, *given, inside)
+    return keys
+
+
+def flow_key(anatomy: Key, implants: Iterable[Key], flow: "FlowSettings") -> Key:
+    """Return the key of one flow.
+
+    Parameters
+    ----------
+    anatomy : key of the anatomy.
+    implants : keys of the implants of the treatment; none in the bare artery.
+    flow : settings of the flow.
+    """
+    deployed = list(implants)
+    unused = () if deployed else ("vstent.deployment",)
+    if flow.numerics.engine == LATTICE:
+        unused = (*unused, "vstent.flow.openfoam")
+    return key_of("vstent.study.stages:compute_flow", anatomy, deployed, flow, without=unused)
+
+
+def uncertainty_key(implant: Key, settings: "Settings", design: "Design") -> Key:
+    """Return the key of the uncertainty study of one implant."""
+    assert settings.uncertainty is not None
+    numbers = settings.uncertainty.numbers_of(design)
+    flow, unused = (settings.flow, ()) if settings.uncertainty.flow_samples else (None, ("vstent.flow",))
+    return key_of("vstent.plan.uncertainty", implant, settings.uncertainty, numbers, flow, without=unused)
+
+
+def study_keys(source: str, settings: "Settings") -> dict[str, Key]:
+    """Return the keys of all stages of a study by their name in the store, in the order in which they are computed.
+
+    Parameters
+    ----------
+    source : SHA-256 of the input.
+    settings : settings of the study.
+
+    Raises
+    ------
+    DeviceError
+        There is no device of a name that a treatment states.
+    """
+    keys = anatomy_keys(source, settings)
+    anatomy = keys[ANATOMY]
+    deployed = {treatment.name: implant_keys(anatomy, treatment) for treatment in settings.treatments}
+    for treatment in settings.treatments:
+        for implant in treatment.implants:
+            keys[f"deploy {stage_name(treatment, implant)}"] = deployed[treatment.name][implant.id]
+    if settings.flow is not None:
+        flown = {BARE: {}} | {one.name: deployed[one.name] for one in settings.treatments if one.has_flow}
+        keys |= {f"flow {name}": flow_key(anatomy, of.values(), settings.flow) for name, of in flown.items()}
+    if settings.uncertainty is not None:
+        for treatment in settings.treatments:
+            if len(treatment.implants) == 1:
+                (key,), (device,) = deployed[treatment.name].values(), treatment.devices
+                keys[f"vary {treatment.name}"] = uncertainty_key(key, settings, find_design(device))
+    return keys
+
+
+def measures_key(settings: "Settings", keys: Mapping[str, Key], failures: Mapping[str, str]) -> Key:
+    """Return the key of all metrics of a study.
+
+    Parameters
+    ----------
+    settings : settings of the study.
+    keys : keys of its stages, of `study_keys`.
+    failures : reasons why a treatment was not deployed or its flow not computed, by name.
+    """
+    designs = [find_design(name) for name in settings.devices]
+    used = list(keys.values()), designs, settings.treatments, dict(failures)
+    return key_of("vstent.study.stages:measure_study", *used)
+
+
+def angiogram_key(flow: Key, settings: "AngiogramSettings") -> Key:
+    """Return the key of the angiogram of a flow, and of the contrast that it carries."""
+    return key_of("vstent.angiography.angiogram", flow, settings)
+
+
+def refuse_missing(path: Path) -> None:
+    """Raise ReadError where an input does not exist."""
+    if not path.exists():
+        raise ReadError(f"{path} does not exist: give a scan (DICOM folder, NIfTI, NRRD, MHA, raw) or a surface")
+
+
+def hash_of(path: Path) -> str:
+    """Return the SHA-256 of an input.
+
+    For a folder it covers the names and contents of all files, in the order of their paths. For one file of a scan that
+    has several, it covers the contents of all of them.
+
+    Raises
+    ------
+    ReadError
+        The input does not exist.
+    """
+    refuse_missing(path)
+    digest = hashlib.sha256()
+    for file in sorted(path.rglob("*")) if path.is_dir() else files_of(path):
+        if file.is_file():
+            digest.update(file.name.encode() + b"\0" if path.is_dir() else b"")
+            with file.open("rb") as stream:
+                while block := stream.read(1 << 20):
+                    digest.update(block)
+    return digest.hexdigest()
