@@ -15,9 +15,9 @@ from vstent.reporting.definitions import DEFINITIONS
 from vstent.study.flow_store import FlowStore
 from vstent.study.folder import CACHE
 from vstent.study.keys import ANATOMY, anatomy_keys
+from vstent.study.progress import OnProgress, Progress
 from vstent.study.stages import find_anatomy
 from vstent.study.store import Key, Store
-from vstent.study.types import OnProgress, Progress
 
 MOST_PROCESSES: Final = 4
 """Largest number of parallel processes."""

@@ -19,7 +19,7 @@ from vstent.app.cases import Case, State
 from vstent.errors import VstentError
 from vstent.study.keys import ANATOMY, anatomy_keys, hash_of
 from vstent.study.pipeline import run
-from vstent.study.types import Progress
+from vstent.study.progress import Progress
 
 WINDOW_S: Final = 8.0
 """Time that the angiogram of the page covers, in s: five seconds after the peak of the usual injection, and more."""

@@ -19,7 +19,7 @@ from vstent.flow.convergence import Refinement
 from vstent.flow.positions import POSITIONS, Scatter
 from vstent.geometry.vessel import Opening
 from vstent.plan.rank import Candidate, Ranking
-from vstent.study.types import Progress
+from vstent.study.progress import Progress
 
 ROWS: Final = (
     ("Neck inflow", "neck_inflow_mL_s"),

@@ -61,7 +61,8 @@ def _rank(arguments: argparse.Namespace) -> int:
     from vstent.plan.rank import rank
     from vstent.study.outputs import write_ranking
     from vstent.study.pipeline import restore_vessel
-    from vstent.study.types import Progress, Settings
+    from vstent.study.progress import Progress
+    from vstent.study.types import Settings
 
     if arguments.retention and not arguments.flow_count:
         raise InputError("Contrast moves with a flow. Give --flow N with --retention.")
@@ -103,7 +104,7 @@ def _with_flows(
     from vstent.study.flow_crew import compute_missing, parallel_flows
     from vstent.study.flow_store import FlowStore
     from vstent.study.keys import ANATOMY, anatomy_keys, hash_of
-    from vstent.study.types import Progress
+    from vstent.study.progress import Progress
 
     def told(done: int, total: int, name: str) -> None:
         console.progress(Progress("rank by flow", done / total, f"{done} of {total}: {name}"))

@@ -13,7 +13,8 @@ from vstent.errors import InputError
 if TYPE_CHECKING:
     from vstent.angiography.angiogram import AngiogramSettings
     from vstent.cli.console import Console
-    from vstent.study.types import CaseResult, OnProgress, Settings
+    from vstent.study.progress import OnProgress
+    from vstent.study.types import CaseResult, Settings
 
 
 def add(commands: options.Commands) -> None:
@@ -115,7 +116,7 @@ def study(
     from vstent.reporting.drawing import Drawing
     from vstent.reporting.write import write_report
     from vstent.study.pipeline import run
-    from vstent.study.types import Progress
+    from vstent.study.progress import Progress
 
     def told(now: Progress) -> None:
         console.progress(now)

@@ -14,7 +14,6 @@ from vstent.io.files import IMAGE_SUFFIXES, SURFACE_SUFFIXES, suffix
 from vstent.io.tables import finite
 from vstent.study.keys import hash_of, measures_key, refuse_missing, study_keys
 from vstent.study.types import Settings
-from vstent.study.written import code_key
 from vstent.units import MM_PER
 
 Number = TypeVar("Number", int, float)

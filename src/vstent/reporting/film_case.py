@@ -15,8 +15,8 @@ from vstent.study.contrast import FOLDER, angiograms
 from vstent.study.films import Recording, stents_of
 from vstent.study.folder import RUN, claimed
 from vstent.study.pipeline import run
+from vstent.study.progress import OnProgress, Progress
 from vstent.study.repeat import finished_run, read_record
-from vstent.study.types import OnProgress, Progress
 
 
 def film_case(

@@ -19,10 +19,10 @@ from vstent.io.tables import write_rows
 from vstent.io.writers import write_json
 from vstent.study.folder import CACHE, claimed
 from vstent.study.keys import ANATOMY, angiogram_key, study_keys
+from vstent.study.progress import OnProgress
 from vstent.study.provenance import METRICS
 from vstent.study.repeat import finished_run
 from vstent.study.store import UNREADABLE, Key, Store
-from vstent.study.types import OnProgress
 
 FOLDER: Final = "angiogram"
 """Subfolder of the case folder with the results."""

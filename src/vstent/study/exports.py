@@ -22,10 +22,11 @@ from vstent.io import writers
 from vstent.io.archive import load_data
 from vstent.study.folder import CACHE, RUN
 from vstent.study.keys import anatomy_keys, hash_of
+from vstent.study.progress import OnProgress
 from vstent.study.repeat import finished_run
 from vstent.study.stages import check_inflow, deploy_implant, find_anatomy
 from vstent.study.store import Store
-from vstent.study.types import OnProgress, Settings
+from vstent.study.types import Settings
 
 
 def export_openfoam(

@@ -29,6 +29,7 @@ ANATOMY: Final = "anatomy"
 VESSEL: Final = "vessel"
 """Name of the vessel before it is trimmed in the store."""
 
+
 def key_of(entry: str, *parts: Any, without: tuple[str, ...] = ()) -> Key:
     """Return the key of a result.
 
@@ -126,7 +127,9 @@ def study_keys(source: str, settings: "Settings") -> dict[str, Key]:
         for implant in treatment.implants:
             keys[f"deploy {stage_name(treatment, implant)}"] = deployed[treatment.name][implant.id]
     if settings.flow is not None:
-        flown = {BARE: {}} | {one.name: deployed[one.name] for one in settings.treatments if one.has_flow}
+        flown: dict[str, dict[str, Key]] = {BARE: {}} | {
+            one.name: deployed[one.name] for one in settings.treatments if one.has_flow
+        }
         keys |= {f"flow {name}": flow_key(anatomy, of.values(), settings.flow) for name, of in flown.items()}
     if settings.uncertainty is not None:
         for treatment in settings.treatments:

@@ -12,9 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from vstent.anatomy.morphology import morphology
-from vstent.devices.catalogue import find_design
 from vstent.devices.stent import Deployment
-from vstent.flow.case import FlowField
 from vstent.flow.convergence import Sensitivity
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io import writers
@@ -22,7 +20,7 @@ from vstent.study.contrast import add_measures, kept_measures
 from vstent.study.crate import NAME as CRATE
 from vstent.study.folder import CACHE, INPUT, LAYOUT, RUN, claiming, implant_folder
 from vstent.study.former import merged, note_begun, refuse_other_anatomy, refuse_other_input
-from vstent.study.keys import ANATOMY, VESSEL, anatomy_keys, hash_of, key_of, measures_key, study_keys
+from vstent.study.keys import ANATOMY, VESSEL, anatomy_keys, hash_of, key_of, measures_key, stage_name, study_keys
 from vstent.study.outputs import (
     IMPLANT,
     take_away_measures,
@@ -32,6 +30,7 @@ from vstent.study.outputs import (
     write_implant,
     write_vessel,
 )
+from vstent.study.progress import OnProgress, Progress
 from vstent.study.provenance import METRICS, provenance
 from vstent.study.repeat import SECONDS, former_source, is_of_another
 from vstent.study.stages import (
@@ -43,11 +42,10 @@ from vstent.study.stages import (
     find_vessel,
     measure_study,
     refine,
-    stage_name,
     vary_all,
 )
 from vstent.study.store import Store
-from vstent.study.types import CaseResult, Computed, OnProgress, Progress, Settings
+from vstent.study.types import CaseResult, Computed, Settings
 
 Implants = Mapping[str, Mapping[str, Deployment]]
 """Deployed implants by treatment and id."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from math import isfinite
 from pathlib import Path
@@ -203,9 +203,7 @@ def deploy_all(
     return found, failures
 
 
-def _deployed(
-    treatment: Treatment, anatomy: Anatomy, store: Store, keys: Mapping[str, Key]
-) -> dict[str, Deployment]:
+def _deployed(treatment: Treatment, anatomy: Anatomy, store: Store, keys: Mapping[str, Key]) -> dict[str, Deployment]:
     """Return the deployed implants of a treatment by id, each stored or computed."""
     found: dict[str, Deployment] = {}
     for implant in treatment.implants:
@@ -509,27 +507,27 @@ def _tell_count(store: Store, stage: str, done: int, total: int) -> None:
 
 def measure_study(
     anatomy: Anatomy,
-    deployments: Mapping[str, Deployment],
+    implants: Mapping[str, Mapping[str, Deployment]],
     fields: Mapping[str, FlowField],
     settings: Settings,
     varied: Mapping[str, Any],
     failures: Mapping[str, str],
 ) -> dict[str, Any]:
-    """Return all metrics of a study: of vessel, devices and flows, with bands, uncertainties and failures.
+    """Return all metrics of a study: of vessel, implants and flows, with bands, uncertainties and failures.
 
     Parameters
     ----------
-    anatomy : vessel, parent artery and sacs.
-    deployments : deployments by device name.
-    fields : flows by name, ``bare`` first.
+    anatomy : vessel, sacs and paths.
+    implants : deployed implants by treatment and id.
+    fields : flows by treatment, ``bare`` first.
     settings : settings of the study.
-    varied : uncertainty metrics by device name.
-    failures : reasons why a device was not deployed or its flow not computed, by name.
+    varied : uncertainty metrics by treatment.
+    failures : reasons why a treatment was not deployed or its flow not computed, by name.
     """
-    metrics = measure_all(anatomy, deployments, fields, settings.flow)
-    band_all(anatomy, deployments, metrics, settings)
+    metrics = measure_all(anatomy, implants, fields, settings.flow)
+    band_all(anatomy, implants, metrics, settings)
     for name, spread in varied.items():
-        metrics["stents"][name]["uncertainty"] = spread
+        metrics["treatments"][name]["uncertainty"] = spread
     return metrics | ({"failures": dict(failures)} if failures else {})
 
 

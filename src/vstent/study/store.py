@@ -22,11 +22,11 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 from vstent.errors import VstentError
 from vstent.io.files import atomic
 from vstent.io.states import states_of
+from vstent.study.progress import OnProgress, Progress
 
 if TYPE_CHECKING:
     from vstent.flow.engines import Progress as FlowProgress
     from vstent.flow.engines import Saved
-    from vstent.study.types import OnProgress, Progress
 
 Kept = TypeVar("Kept")
 KEY_DIGITS: Final = 12
@@ -64,7 +64,7 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
-def silent(progress: "Progress") -> None:
+def silent(progress: Progress) -> None:
     """Report nothing."""
 
 
@@ -77,7 +77,7 @@ class Store:
     progress : called at every stage.
     """
 
-    def __init__(self, folder: Path, progress: "OnProgress" = silent) -> None:
+    def __init__(self, folder: Path, progress: OnProgress = silent) -> None:
         self.folder, self._watch = folder, progress
         self.seconds: dict[str, float] = {}
         self._held: list[tuple[str, Callable[[], None]]] = []
@@ -87,8 +87,6 @@ class Store:
 
     def progress(self, stage: str, fraction: float, detail: str, **more: Any) -> None:
         """Report the progress of a stage; the arguments are the fields of a `Progress`."""
-        from vstent.study.types import Progress
-
         self._watch(Progress(stage, fraction, detail, **more))
 
     @contextmanager

@@ -1,6 +1,6 @@
 """Settings and result of a study."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -97,28 +97,6 @@ class Computed:
 
 
 @dataclass(frozen=True, eq=False)
-class Progress:
-    """State of a stage of a study."""
-
-    stage: str
-    """Name of the stage: a word, and the treatment and implant it is about, such as ``deploy silk``."""
-    fraction: float
-    """Completed fraction: 0 as the stage begins, 1 as it ends."""
-    detail: str = ""
-    """Result of a finished stage, or what is being done, in words."""
-    residual: float | None = None
-    """Largest expected remaining change of any monitored quantity of a flow, as a fraction; None: unknown."""
-    seconds_left: float | None = None
-    """Estimated remaining run time in s; None: unknown."""
-    computed: Computed | None = None
-    """What is about to be measured, where the stage ``measure`` begins."""
-
-
-OnProgress = Callable[[Progress], None]
-"""Called at every stage of a study."""
-
-
-@dataclass(frozen=True, eq=False)
 class CaseResult(Computed):
     """Result of a study."""
 
@@ -132,5 +110,5 @@ class CaseResult(Computed):
     """Reason why a treatment was not deployed or its flow not computed, by treatment."""
     notes: tuple[str, ...]
     """Findings, assumptions and repairs, and the reliability of every flow, one sentence each."""
-    keys: "dict[str, Key]"
+    keys: dict[str, Key]
     """Keys of the stages by name."""
