@@ -9,6 +9,7 @@ import pytest
 
 from vstent import phantoms
 from vstent.devices.catalogue import find_design
+from vstent.devices.treatment import with_device
 from vstent.errors import FlowError, InputError, LandingError
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.settings import FlowSettings, Numerics
@@ -18,11 +19,12 @@ from vstent.io.writers import write_stl
 from vstent.plan.rank import rank
 from vstent.plan.uncertainty import Ranges
 from vstent.study import stages
-from vstent.study.keys import deployment_key, study_keys
+from vstent.study import keys as study_keying
+from vstent.study.keys import implant_keys, study_keys
 from vstent.study.outputs import write_ranking
 from vstent.study.pipeline import refine_flow, restore_vessel, run, trace_vessel
 from vstent.study.store import Key
-from vstent.study.types import Placing, Settings
+from vstent.study.types import AnatomySettings, InputSettings, Settings
 
 FLOW = FlowSettings(inflow_mL_s=2.0, numerics=Numerics(cell_size_mm=0.5, max_steps=20))
 PLAIN = Settings(devices=("silk",), units="mm", flow=None)
@@ -193,20 +195,24 @@ def test_keys_change_with_what_a_stage_uses_and_with_nothing_else() -> None:
         other = study_keys("source", replace(Settings(), **settings))
         return {name for name in keys if name in other and other[name] != keys[name]}
 
-    assert changed(placings={"silk": Placing(4.0, 20.0)}) == {"deploy silk", "flow silk"}
+    sized, enterprise = with_device("silk", diameter_mm=4.0, length_mm=20.0), with_device("enterprise")
+    assert changed(treatments=(sized, enterprise)) == {"deploy silk", "flow silk"}
     assert changed(flow=FLOW) == {"flow bare", "flow silk", "flow enterprise"}
-    assert changed(outlet_mm=(0.0, 0.0, 0.0)) == {*keys} - {"vessel"}
-    assert changed(without_flow=("silk",)) == set()
-    assert changed(threshold=500.0) == {*keys}
+    assert changed(anatomy=AnatomySettings(outlet_mm=(0.0, 0.0, 0.0))) == {*keys} - {"vessel"}
+    assert changed(treatments=(replace(with_device("silk"), has_flow=False), enterprise)) == set()
+    assert changed(input=InputSettings(threshold=500.0)) == {*keys}
 
 
-def test_a_deployment_is_found_again_though_ranges_and_sources_of_its_numbers_change() -> None:
+def test_a_deployment_is_found_again_though_ranges_and_sources_of_its_numbers_change(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     design, anatomy = find_design("silk"), Key("given", "code")
     assert design.ranges
     assert design.facts
 
     def key(**numbers: object) -> Key:
-        return deployment_key(anatomy, PLAIN, "silk", replace(design, **numbers))
+        monkeypatch.setattr(study_keying, "find_design", lambda _: replace(design, **numbers))
+        return implant_keys(anatomy, with_device("silk"))["silk"]
 
     assert key(ranges=(), facts=()) == key()
     assert key(braid_angle_rad=1.1) != key()
