@@ -1,9 +1,11 @@
 """What the terminal's tables say: every value with the unit and the digits of the report."""
 
+import pytest
 from rich.table import Table
 
-from vstent.cli.console import comparison_table, flow_table, opening_table
+from vstent.cli.console import _state, comparison_table, flow_table, opening_table
 from vstent.geometry.vessel import Opening
+from vstent.study.types import Progress
 
 BARE = {"neck_inflow_mL_s": 6.861, "mean_sac_velocity_m_s": 0.4049, "turnover_time_s": 0.0571}
 AFTER = {"neck_inflow_mL_s": 4.453, "mean_sac_velocity_m_s": 0.2381, "turnover_time_s": 0.0880}
@@ -20,7 +22,7 @@ def columns(table: Table) -> list[list[str]]:
 
 
 def test_the_comparison_tells_every_value_with_its_unit() -> None:
-    metrics = {"bare": BARE, "stents": {"silk": {"deployment": DEPLOYED, "flow": AFTER}}}
+    metrics = {"treatments": {"bare": {"flow": BARE}, "silk": {"implants": {"silk": DEPLOYED}, "flow": AFTER}}}
     names, bare, silk = columns(comparison_table(metrics))
     assert dict(zip(names, bare, strict=True))["Neck inflow"] == "6.86 mL/s"
     assert dict(zip(names, silk, strict=True)) == {
@@ -36,10 +38,32 @@ def test_the_comparison_tells_every_value_with_its_unit() -> None:
 
 def test_the_flows_table_compares_numbers_and_not_how_sure_they_are() -> None:
     sure = {"unsettled_fraction": 0.0279}
-    metrics = {"bare": BARE | sure, "stents": {"silk": {"flow": AFTER | {"unsettled_fraction": 0.00762}}}}
+    silk = {"implants": {"silk": DEPLOYED}, "flow": AFTER | {"unsettled_fraction": 0.00762}}
+    metrics = {"treatments": {"bare": {"flow": BARE | sure}, "silk": silk}}
     names, bare, silk = columns(flow_table(metrics))
     assert (bare[-1], silk[-1]) == ("2.79 %", "0.762 %")
     assert silk[names.index("Neck inflow")] == "4.45 mL/s (-35%)"
+
+
+def test_of_several_implants_every_measure_is_told_in_their_order() -> None:
+    inner = DEPLOYED | {"size": "3.0 x 15 mm", "apposed_fraction": 0.5}
+    metrics = {"treatments": {"both": {"implants": {"silk": DEPLOYED, "silk_2": inner}}}}
+    names, _, both = columns(comparison_table(metrics))
+    assert dict(zip(names, both, strict=True))["Size (label)"] == "3.5 x 15 mm + 3.0 x 15 mm"
+    assert dict(zip(names, both, strict=True))["Apposed"] == "91.7 % + 50.0 %"
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        (Progress("flow silk", 0.5, residual=0.0279, seconds_left=61.4), "2.8% from convergence, 61 s left"),
+        (Progress("vary silk", 0.5, "3 of 32"), "3 of 32"),
+        (Progress("angiogram bare", 0.5, seconds_left=0.0), "0 s left"),
+        (Progress("segment", 0.0), ""),
+    ],
+)
+def test_an_unfinished_stage_tells_what_is_known_of_it(told: Progress, words: str) -> None:
+    assert _state(told) == words
 
 
 def test_openings_are_told_with_their_units() -> None:
@@ -48,10 +72,10 @@ def test_openings_are_told_with_their_units() -> None:
 
 
 def test_what_one_device_lacks_leaves_its_cell_empty_and_what_all_lack_has_no_row() -> None:
-    stents = {
-        "silk": {"deployment": {key: DEPLOYED[key] for key in ("size", "apposed_fraction")}},
-        "enterprise": {"deployment": {"size": "4.5 x 22 mm"}},
+    treatments = {
+        "silk": {"implants": {"silk": {key: DEPLOYED[key] for key in ("size", "apposed_fraction")}}},
+        "enterprise": {"implants": {"enterprise": {"size": "4.5 x 22 mm"}}},
     }
-    names, *cells = columns(comparison_table({"stents": stents}))
+    names, *cells = columns(comparison_table({"treatments": treatments}))
     assert names == ["Size (label)", "Apposed"]
     assert cells == [["", ""], ["3.5 x 15 mm", "91.7 %"], ["4.5 x 22 mm", ""]]

@@ -57,7 +57,7 @@ def test_every_number_and_its_definition_stand_in_the_pdf(told, printed):
     assert "Braid angle " in text
     assert "braid angle rad" not in text
     assert OF_PULSE in text.partition("Definitions")[2]
-    for quantity in (*told.vessel, *(q for stent in told.stents for q in stent["quantities"])):
+    for quantity in (*told.vessel, *(q for implant in told.implants for q in implant["quantities"])):
         assert quantity.name in text, quantity
         assert " ".join(quantity.text.split()) in text, quantity
     for row in told.changes:
@@ -112,7 +112,7 @@ def test_spheres_on_the_axis_are_as_wide_as_the_artery_and_follow_it_from_end_to
 
 def test_expansion_begins_at_the_first_contour_and_ends_at_the_deployed_one():
     case = report_case.case()
-    deployment = case.deployments["silk"]
+    deployment = case.implants["silk"]["silk"]
     frames, gaps = thin_frames(deployment, case.anatomy.parent.landing_surface, 4)
     chosen = some_frames(deployment, 4)
     assert chosen.tolist() == [0, 2, 4, 7]
@@ -122,9 +122,9 @@ def test_expansion_begins_at_the_first_contour_and_ends_at_the_deployed_one():
 
 def test_a_contour_that_lies_on_the_wall_from_the_first_is_shown_too():
     case = report_case.case()
-    deployment = case.deployments["silk"]
+    deployment = case.implants["silk"]["silk"]
     still = np.repeat(deployment.history_mm[-1:], 3, axis=0)
     energy, gap = deployment.energy_mm2[:3], np.zeros_like(deployment.wall_gap_mm)
-    case.deployments = {"silk": replace(deployment, history_mm=still, energy_mm2=energy, wall_gap_mm=gap)}
-    scene = scene_of(case.anatomy, case.deployments, case.fields)
-    assert _expansion("silk", case.deployments["silk"], case.anatomy, scene).drawn().image.std() > 1
+    still = replace(deployment, history_mm=still, energy_mm2=energy, wall_gap_mm=gap)
+    scene = scene_of(case.anatomy, {"silk": {"silk": still}}, case.fields)
+    assert _expansion("silk", 0, still, case.anatomy, scene).drawn().image.std() > 1

@@ -1,4 +1,4 @@
-"""The plan: one page per device, with the measured numbers, and alternatives that a brute-force ranking confirms."""
+"""The plan: one page per implant, with the measured numbers, and alternatives that a brute-force ranking confirms."""
 
 import re
 from dataclasses import replace
@@ -11,6 +11,7 @@ from vstent import phantoms
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.deployment.measure import measure
+from vstent.devices.stent import Deployment
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.plan.bands import bands
 from vstent.plan.rank import alternatives, rank
@@ -28,10 +29,14 @@ def anatomy() -> Anatomy:
 
 @pytest.fixture(scope="module")
 def planned() -> tuple[Planned, bytes, str]:
-    """A case with two devices, its plan, and all text that was put on the pages."""
-    deployments = {name: vstent.deploy(vstent.find_design(name), anatomy()) for name in ("silk", "enterprise")}
-    measures = {name: measure(anatomy(), one) for name, one in deployments.items()}
-    case = Planned("Case 7", anatomy(), deployments, measures, "9f" * 32, "2026-11-26")
+    """A case of two treatments, one with two implants, its plan, and all text that was put on the pages."""
+    silk, enterprise = (vstent.deploy(vstent.find_design(name), anatomy()) for name in ("silk", "enterprise"))
+    inner = vstent.deploy(vstent.find_design("silk"), anatomy(), inside=[enterprise.stent])
+    implants = {"silk": {"silk": silk}, "both": {"enterprise": enterprise, "silk": inner}}
+    metrics = {
+        name: {key: measure(anatomy(), one) for key, one in deployed.items()} for name, deployed in implants.items()
+    }
+    case = Planned("Case 7", anatomy(), implants, metrics, "9f" * 32, "2026-11-26")
     pdf, words, _ = printed(case)
     return case, pdf, " ".join(" ".join(words).split()).replace("\u202f", " ")
 
@@ -51,45 +56,52 @@ def printed(case: Planned) -> tuple[bytes, list[str], float]:
     return pdf, [text for text, _ in last], min(size for _, size in last)
 
 
-def test_every_device_has_one_page(planned) -> None:
+def all_of(case: Planned) -> list[tuple[Deployment, dict]]:
+    """Every implant of a case with its metrics."""
+    return [(one, case.metrics[name][key]) for name, found in case.implants.items() for key, one in found.items()]
+
+
+def test_every_implant_has_one_page(planned) -> None:
     _, pdf, _ = planned
-    assert len(re.findall(rb"/MediaBox", pdf)) == 2
+    assert len(re.findall(rb"/MediaBox", pdf)) == 3
 
 
 def test_a_page_with_much_to_say_is_still_one_page_that_can_be_read(planned) -> None:
     case, _, text = planned
     note = "A long note says what is wrong, where it is in mm, and what the reader should do about it. " * 2
-    crowded = case._replace(anatomy=replace(case.anatomy, notes=(note, note, note)), bands=banded(case))
+    crowded = case._replace(anatomy=replace(case.anatomy, notes=(note, note, note)), metrics=banded(case))
     pdf, words, smallest_points = printed(crowded)
-    assert len(re.findall(rb"/MediaBox", pdf)) == 2
+    assert len(re.findall(rb"/MediaBox", pdf)) == 3
     assert len(" ".join(words)) > 1.2 * len(text)
     assert smallest_points > 5.2
 
 
-def banded(case: Planned) -> dict[str, dict[str, object]]:
-    """Bands of the devices of a case, as in the metrics of a study."""
-    return {
-        name: bands(anatomy(), deployment, case.measures[name], is_proposed=True).metrics()
-        | {"device": f"Numbers of {name}: 2 cited, 3 estimated."}
-        for name, deployment in case.deployments.items()
-    }
+def banded(case: Planned) -> dict[str, dict[str, dict]]:
+    """Metrics of the implants of a case with bands, as those of a study."""
+
+    def of(name: str, key: str) -> dict:
+        deployment, measures = case.implants[name][key], case.metrics[name][key]
+        found = bands(anatomy(), deployment, measures, is_proposed=True).metrics()
+        return measures | {"bands": found | {"device": f"Numbers of {key}: 2 cited, 3 estimated."}}
+
+    return {name: {key: of(name, key) for key in found} for name, found in case.implants.items()}
 
 
 def test_it_states_what_was_measured(planned) -> None:
     case, _, text = planned
-    for name, deployment in case.deployments.items():
+    for deployment, metrics in all_of(case):
         assert f"{deployment.stent.deployed_length_mm:.1f} mm (" in text
-        assert f"{100 * case.measures[name]['neck_metal_coverage_fraction']:.1f} %" in text
+        assert f"{100 * metrics['neck_metal_coverage_fraction']:.1f} %" in text
     assert "2026-11-26" in text
     assert "9f9f9f9f9f9f9f9f…" in text
-    assert text.count("8 more notes are in the report.") == 2
-    assert text.count("signature") == 2
+    assert text.count("8 more notes are in the report.") == 3
+    assert text.count("signature") == 3
     assert "Research use only" in text
 
 
 def test_alternatives_are_the_best_neighbours(planned) -> None:
     case, _, text = planned
-    stent = case.deployments["silk"].stent
+    stent = case.implants["silk"]["silk"].stent
     found = alternatives(anatomy(), stent.design, stent.size)
     assert len(found) == 2
     for one in found:

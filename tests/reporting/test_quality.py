@@ -24,11 +24,11 @@ def graded(**grades: str) -> dict:
         "inflow_mL_s": 3.74,
         "inlet_reynolds_number_count": 297.4,
     }
-    quality = {
-        name: {"grade": grade, "reasons": [] if grade == "good" else ["9 cells across the neck"]} | measures
-        for name, grade in grades.items()
-    }
-    return report_case.metrics() | {"flow_quality": quality}
+    metrics = report_case.metrics()
+    for name, grade in grades.items():
+        reasons = [] if grade == "good" else ["9 cells across the neck"]
+        metrics["treatments"][name]["quality"] = {"grade": grade, "reasons": reasons} | measures
+    return metrics
 
 
 def changes(metrics: dict) -> dict[str, list[str]]:
@@ -90,5 +90,5 @@ def test_better_and_worse_only_where_a_direction_is_wanted() -> None:
     assert rows["turnover_time_s"].sense("silk") == "better"  # longer
     assert rows["mean_sac_wss_Pa"].sense("silk") == ""
     worse = report_case.metrics()
-    worse["stents"]["silk"]["flow"]["neck_inflow_mL_s"] = 0.5
+    worse["treatments"]["silk"]["flow"]["neck_inflow_mL_s"] = 0.5
     assert {row.before.key: row for row in compare(worse)}["neck_inflow_mL_s"].sense("silk") == "worse"

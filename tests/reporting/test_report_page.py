@@ -29,7 +29,7 @@ def page():
 def bare_case(**changes):
     """A case without devices and flow, quick to draw."""
     case = report_case.case()
-    empty = {"deployments": {}, "fields": {}, "metrics": {"vessel": case.metrics["vessel"]}}
+    empty = {"implants": {}, "fields": {}, "metrics": {"vessel": case.metrics["vessel"]}}
     return SimpleNamespace(**{**vars(case), **empty, **changes})
 
 
@@ -243,8 +243,10 @@ def test_changes():
 def test_only_what_was_measured_on_both_sides_is_compared():
     rows = compare(
         {
-            "bare": {"a_mm": 1.0, "b_mm": 2.0, "ok": True},
-            "stents": {"x": {"flow": {"b_mm": 1.0, "c_mm": 3.0, "ok": True}}},
+            "treatments": {
+                "bare": {"flow": {"a_mm": 1.0, "b_mm": 2.0, "ok": True}},
+                "x": {"flow": {"b_mm": 1.0, "c_mm": 3.0, "ok": True}},
+            }
         }
     )
     assert [(row.before.key, row.after["x"].value) for row in rows] == [("b_mm", 1.0)]
@@ -252,7 +254,7 @@ def test_only_what_was_measured_on_both_sides_is_compared():
 
 def test_how_sure_a_flow_is_is_no_change_but_told():
     flow = {"mean_sac_velocity_m_s": 1.0, "unsettled_fraction": 0.0279}
-    metrics = {"bare": flow, "stents": {"silk": {"flow": flow | {"unsettled_fraction": 0.00762}}}}
+    metrics = {"treatments": {"bare": {"flow": flow}, "silk": {"flow": flow | {"unsettled_fraction": 0.00762}}}}
     assert [row.before.key for row in compare(metrics)] == ["mean_sac_velocity_m_s"]
     html = as_html(replace(report_case.contents(), metrics=metrics, changes=compare(metrics)))
     text = Page(html).text.replace("\u202f", " ")
@@ -274,7 +276,8 @@ def test_ratios_and_openings_go_by_the_words_of_what_they_are_of():
         (quantity,) = flatten({key: 0.5})
         assert quantity.name == name
         assert quantity.definition.meaning
-    metrics = {"bare": {"outlet_3_flow_mL_s": 0.5}, "stents": {"silk": {"ratios": {"mean_wss_Pa_ratio": 0.5}}}}
+    treatments = {"bare": {"flow": {"outlet_3_flow_mL_s": 0.5}}, "silk": {"change": {"mean_wss_Pa_ratio": 0.5}}}
+    metrics = {"treatments": treatments}
     told = replace(report_case.contents(), metrics=metrics).definitions
     assert told == [(DEFINITIONS["outlet_flow_mL_s"], "mL/s"), (DEFINITIONS["mean_wss_Pa"], "Pa")]
 

@@ -49,7 +49,7 @@ def test_the_side_that_hides_less_is_chosen():
     screen = report_case.sphere(12.0 * free + [0, 0, 9.0], 5.0)
     vessel = SimpleNamespace(lumen=report_case.joined(case.anatomy.vessel.lumen, screen))
     hidden = SimpleNamespace(vessel=vessel, axis=case.anatomy.parent.axis, aneurysms=case.anatomy.aneurysms)
-    chosen = views_of(hidden, case.deployments)[0].axes
+    chosen = views_of(hidden, [one for found in case.implants.values() for one in found.values()])[0].axes
     assert chosen[2] == pytest.approx(-free)
     assert np.linalg.det(chosen) == pytest.approx(1)  # turned round, not mirrored
 

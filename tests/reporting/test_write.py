@@ -35,7 +35,7 @@ def test_an_unchanged_report_is_not_painted_again(painted: list[str], tmp_path: 
     write_report(case, tmp_path, is_printed=True)  # there is no PDF yet
     write_report(case, tmp_path, is_printed=True)
     assert len(painted) == 2
-    case.metrics["bare"]["neck_inflow_mL_s"] *= 1.0001
+    case.metrics["treatments"]["bare"]["flow"]["neck_inflow_mL_s"] *= 1.0001
     write_report(case, tmp_path)
     assert len(painted) == 3
     (tmp_path / "report.html").unlink()
@@ -49,11 +49,13 @@ def test_an_interrupted_report_is_painted_again(
     (tmp_path / CACHE).mkdir()
     case = report_case.case()
     write_report(case, tmp_path)
-    case.metrics["bare"]["neck_inflow_mL_s"] *= 2
+    case.metrics["treatments"]["bare"]["flow"]["neck_inflow_mL_s"] *= 2
     with monkeypatch.context() as stopped:
         stopped.setattr(write, "write_text", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             write_report(case, tmp_path)
-    case.metrics["bare"]["neck_inflow_mL_s"] /= 2  # as at first: the old page may be half of the new one
+    case.metrics["treatments"]["bare"]["flow"]["neck_inflow_mL_s"] /= (
+        2  # as at first: the old page may be half of the new one
+    )
     write_report(case, tmp_path)
     assert len(painted) == 3

@@ -209,7 +209,7 @@ def as_html(told: Contents) -> str:
         film=base64.b64encode(told.film).decode("ascii"),
         vessel=told.vessel,
         openings=told.openings,
-        stents=told.implants,
+        implants=told.implants,
         flow=told.changes,
         of_pulse=OF_PULSE,
         is_pulse=told.is_pulse,

@@ -83,19 +83,19 @@ def _changes(paper: Paper, told: Contents, rows: list[Change]) -> None:
 
 
 def _devices(paper: Paper, told: Contents) -> None:
-    """Write the section of every device."""
-    for stent in told.implants:
-        paper.heading(stent["title"])
-        paper.text(stent["words"])
-        paper.text(stent["advice"])
-        paper.table(_rows(stent["quantities"], 3), (0.66, 0.34))
-        if stent["how_sure"]:
-            paper.text(stent["how_sure"])
-        if stent["bands"]:
-            cells = [(row.name, row.value, f"{row.low} to {row.high}", row.cause) for row in stent["bands"]]
+    """Write the section of every implant."""
+    for implant in told.implants:
+        paper.heading(implant["title"])
+        paper.text(implant["words"])
+        paper.text(implant["advice"])
+        paper.table(_rows(implant["quantities"], 2), (0.66, 0.34))
+        if implant["how_sure"]:
+            paper.text(implant["how_sure"])
+        if implant["bands"]:
+            cells = [(row.name, row.value, f"{row.low} to {row.high}", row.cause) for row in implant["bands"]]
             paper.table(cells, (0.34, 0.13, 0.23, 0.30), head=("Result", "Value", "Band (95 %)", "Largest cause"))
         paper.text("Sources of the device's numbers:", 8, color=QUIET)
-        paper.table(stent["facts"], (0.26, 0.74))
+        paper.table(implant["facts"], (0.26, 0.74))
 
 
 def _flow(paper: Paper, told: Contents) -> None:
