@@ -1,4 +1,4 @@
-"""Options: every help has an example that parses, every option is explained, and a device is given once."""
+"""Options: every command's help has an example that parses, and every option is explained."""
 
 import argparse
 import re

@@ -30,7 +30,8 @@ from vstent.io.writers import write_stl
 from vstent.reporting.cohort import cohort_report, modified_z_scores
 from vstent.study.crews import DaskCluster, Processes, Slurm
 from vstent.study.pipeline import run as run_study
-from vstent.study.types import Placing, Settings
+from vstent.study.settings import Settings
+from vstent.study.types import Placing
 
 PLACED = {"enterprise": Placing(center_mm=27.0)}
 """Within an artery of 44 mm, beyond the end of one of 11 mm that is continued to 31.5 mm."""

@@ -22,8 +22,9 @@ from vstent.geometry.vessel import Vessel
 from vstent.io.writers import write_stl
 from vstent.phantoms import demo_phantom, phantom_surface
 from vstent.plan import uncertainty
+from vstent.plan.ranges import Ranges
 from vstent.plan.shares import first_order_shares
-from vstent.plan.uncertainty import CAUSES, Ranges, vary
+from vstent.plan.uncertainty import CAUSES, vary
 from vstent.plan.widening import widened
 from vstent.study.folder import CACHE
 from vstent.study.store import Unfinished

@@ -16,11 +16,12 @@ from vstent.cli import main
 from vstent.flow.settings import FlowSettings
 from vstent.flow.waveform import OLDER_ADULT_ICA
 from vstent.io.writers import write_json, write_stl
-from vstent.plan.uncertainty import Ranges
+from vstent.plan.ranges import Ranges
 from vstent.study import repeat as repeating
 from vstent.study.crate import write_crate
 from vstent.study.repeat import agreement
-from vstent.study.types import Placing, Settings
+from vstent.study.settings import Settings
+from vstent.study.types import Placing
 
 
 @pytest.fixture(scope="module")
