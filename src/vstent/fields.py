@@ -170,7 +170,9 @@ class Option:
         for one in value if isinstance(value, tuple | list) else [value]:
             if isinstance(one, tuple | list):
                 self.check(one)
-            elif isinstance(one, int | float) and not (self.low <= one <= self.high and self.above < one):
+            elif isinstance(one, int | float) and not (
+                self.low <= one <= self.high and self.above < one and math.isfinite(one)
+            ):
                 raise InputError(f"{one:g} {self.unit}".rstrip() + f" is out of range: give {self.limits}")
 
 

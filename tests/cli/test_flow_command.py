@@ -81,14 +81,17 @@ def test_the_blood_asked_for_is_the_blood_computed(words: list[str], expected: B
     assert options.given_settings(parser.parse_args(words)).flow.blood == expected
 
 
-@pytest.mark.parametrize(
-    "words", [["--steady", "--pulsatile"], ["--pulsatile", "--steady"], ["--convergence", "--device", "silk"]]
-)
+@pytest.mark.parametrize("words", [["--steady", "--pulsatile"], ["--pulsatile", "--steady"]])
 def test_what_excludes_each_other_is_refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stopped:
         main(["flow", "tube.stl", "--out", "out", *words])
     assert stopped.value.code == 2
     assert "not allowed with" in capsys.readouterr().err
+
+
+def test_flows_on_several_grids_are_those_without_a_device(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["flow", "tube.stl", "--out", "out", "--convergence", "--device", "silk"]) == 2
+    assert "--convergence compares flows without a device" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["run", "flow"])

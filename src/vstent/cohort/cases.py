@@ -131,7 +131,7 @@ def _read(cells: Mapping[str, str], folder: Path) -> dict[str, Any]:
             else:
                 found[title] = OPTIONS[title].cell(text, folder)
         except InputError as error:
-            raise InputError(f"{title}: {error}") from error
+            raise InputError(f"column {title}: {error}") from error
     return found
 
 
