@@ -26,7 +26,7 @@ from vstent.cohort.work import COST, Row
 from vstent.io.writers import write_stl
 from vstent.phantoms import Phantom
 from vstent.study.crews import DaskCluster
-from vstent.study.types import Settings
+from vstent.study.settings import Settings
 
 SEED = 7
 EDGE_MM = 0.3

@@ -52,7 +52,7 @@ import os, pathlib, signal, sys
 from vstent.flow import engines
 from vstent.flow.case import FlowSettings
 from vstent.study.pipeline import run
-from vstent.study.types import Settings
+from vstent.study.settings import Settings
 
 moment, path, out = sys.argv[1:]
 replace = os.replace

@@ -37,9 +37,9 @@ if TYPE_CHECKING:
     from vstent.plan.rank import rank as rank
     from vstent.reporting.page import report as report
     from vstent.study.pipeline import run as run
-    from vstent.study.types import AnatomySettings as AnatomySettings
-    from vstent.study.types import InputSettings as InputSettings
-    from vstent.study.types import Settings as Settings
+    from vstent.study.settings import AnatomySettings as AnatomySettings
+    from vstent.study.settings import InputSettings as InputSettings
+    from vstent.study.settings import Settings as Settings
 
 _HOMES = {
     "read_vessel": "vstent.anatomy.read",
@@ -72,9 +72,9 @@ _HOMES = {
     "Treatment": "vstent.devices.treatment",
     "Implant": "vstent.devices.treatment",
     "Placing": "vstent.devices.treatment",
-    "InputSettings": "vstent.study.types",
-    "AnatomySettings": "vstent.study.types",
-    "Settings": "vstent.study.types",
+    "InputSettings": "vstent.study.settings",
+    "AnatomySettings": "vstent.study.settings",
+    "Settings": "vstent.study.settings",
 }
 """Module that defines each public function and data class."""
 

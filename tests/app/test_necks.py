@@ -9,8 +9,8 @@ from vstent.anatomy.morphology import morphology
 from vstent.app import necks
 from vstent.app.cases import State, dependencies
 from vstent.app.choices import NECK_HANDLES, Choices
-from vstent.plan.uncertainty import Ranges
-from vstent.study.types import Settings
+from vstent.plan.ranges import Ranges
+from vstent.study.settings import Settings
 
 
 @pytest.fixture(scope="module")

@@ -36,13 +36,13 @@ from vstent.io.archive import load_data, save_data
 from vstent.io.dicom_writer import write_dicom
 from vstent.io.images import read_image
 from vstent.io.writers import write_stl
-from vstent.plan.uncertainty import Ranges
+from vstent.plan.ranges import Ranges
 from vstent.study import store as stored
 from vstent.study.flow_store import FlowStore
 from vstent.study.folder import CACHE
 from vstent.study.keys import hash_of, study_keys
 from vstent.study.repeat import settings_of
-from vstent.study.types import InputSettings, Settings
+from vstent.study.settings import InputSettings, Settings
 
 
 def alone(device, **given):

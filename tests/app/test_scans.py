@@ -12,7 +12,7 @@ from vstent.app.scans import Scan
 from vstent.errors import InputError
 from vstent.geometry.image import Image
 from vstent.study.keys import anatomy_keys
-from vstent.study.types import Settings
+from vstent.study.settings import Settings
 
 SPACING_MM = np.array([0.7, 0.4, 1.1])
 SHAPE = (46, 62, 34)

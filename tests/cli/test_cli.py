@@ -202,7 +202,7 @@ def test_a_number_may_begin_with_a_minus() -> None:
     given = parser.parse_args(["run", "scan.nii", "--out", "out", *words])
     assert (given.at, given.inlet, given.outlet) == ((-1.5, -8.0, 20.0), [(-0.5, 0.0, 0.0)], (-10.0, 2.0, 3.0))
     assert (given.center, given.processes) == (-10.0, 2)
-    assert parser.parse_args(["rank", "scan.nii", "--out", "out", "--shift", "-2,0,2"]).shift == [-2.0, 0.0, 2.0]
+    assert parser.parse_args(["rank", "scan.nii", "--out", "out", "--shift", "-2,0,2"]).shift == (-2.0, 0.0, 2.0)
 
 
 @pytest.mark.parametrize(
@@ -211,9 +211,11 @@ def test_a_number_may_begin_with_a_minus() -> None:
         (["--viscosity", "4"], "4 mPa s are 0.004"),
         (["--viscosity", "1e-6"], "Pa s"),
         (["--density", "1.06"], "1.06 g/mL are 1060"),
+        (["--flow-rate", "240"], "240 mL/min are 4"),
+        (["--grid-spacing", "200"], "200 mm is out of range: give 0.04 to 1 mm"),
     ],
 )
-def test_blood_in_other_units_is_refused(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_numbers_in_other_units_are_refused(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stopped:
         main(["flow", "artery.stl", "--out", "out", *words])
     assert stopped.value.code == 2
@@ -227,7 +229,7 @@ def test_an_inflow_in_other_units_is_refused_before_anything_is_written(
     command: list[str], artery: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    assert main([*command, str(artery), "--out", str(out), "--units", "mm", "--flow-rate", "240"]) == 2
+    assert main([*command, str(artery), "--out", str(out), "--units", "mm", "--flow-rate", "40"]) == 2
     assert _complaint(capsys, "240 mL/min are 4")
     assert not out.exists()
 

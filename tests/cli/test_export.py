@@ -17,7 +17,7 @@ from vstent.io.surfaces import read_surface
 from vstent.io.vtk_child import read_apart
 from vstent.io.writers import write_stl
 from vstent.study.pipeline import run
-from vstent.study.types import InputSettings, Settings
+from vstent.study.settings import InputSettings, Settings
 
 
 @pytest.fixture(scope="module")

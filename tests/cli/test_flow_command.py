@@ -2,7 +2,6 @@
 
 import argparse
 import json
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -33,12 +32,12 @@ def test_flow_alone_in_a_tube_is_poiseuilles_and_is_not_computed_twice(
     said = capsys.readouterr()
     assert "Inlet flow" in said.out
     assert "Grid spacing 0.25 mm (" in said.err
-    assert sorted(file.name for file in (out / "flow" / "bare").iterdir()) == ["field.vtu", "wall.vtp"]
-    bare = json.loads((out / "metrics.json").read_text())["bare"]
+    assert sorted(file.name for file in (out / "treatments" / "bare" / "flow").iterdir()) == ["field.vtu", "wall.vtp"]
+    bare = json.loads((out / "metrics.json").read_text())["treatments"]["bare"]["flow"]
     assert bare["inlet_flow_mL_s"] == pytest.approx(INFLOW_ML_S, rel=5e-3)
     assert bare["outlet_1_flow_mL_s"] == pytest.approx(bare["inlet_flow_mL_s"], rel=1e-3)
     assert bare["pressure_drop_Pa"] == pytest.approx(2 * LENGTH_MM / RADIUS_MM * STRESS_PA, rel=0.05)
-    points, stress = _wall(out / "flow" / "bare" / "wall.vtp")
+    points, stress = _wall(out / "treatments" / "bare" / "flow" / "wall.vtp")
     middle = np.abs(points[:, 2] - LENGTH_MM / 2) < 4
     along = np.sign(stress[middle, 2].mean())
     np.testing.assert_allclose(along * stress[middle].mean(axis=0), [0, 0, STRESS_PA], atol=0.03 * STRESS_PA)
@@ -61,10 +60,10 @@ def test_openfoam_gets_the_vessel_after_its_cost_is_told(
     assert main([*command, "--units", "mm"]) == 1
     told = " ".join(capsys.readouterr().err.split())
     assert 0 < told.index("OpenFOAM: about") < told.index("It is not here")
-    assert asked == [(tmp_path / "out" / "flow" / "bare" / "openfoam", ())]
+    assert asked == [(tmp_path / "out" / "treatments" / "bare" / "flow" / "openfoam", ())]
     assert main([*command, "--units", "mm", "--convergence", "--grid-spacing", "0.25"]) == 1
     assert "It is not here" in capsys.readouterr().err
-    assert asked[1] == (tmp_path / "out" / "flow" / "convergence" / "openfoam" / "cell_size_mm-0.5", ())
+    assert asked[1] == (tmp_path / "out" / "convergence" / "openfoam" / "cell_size_mm-0.5", ())
 
 
 @pytest.mark.parametrize(
@@ -78,18 +77,21 @@ def test_openfoam_gets_the_vessel_after_its_cost_is_told(
 )
 def test_the_blood_asked_for_is_the_blood_computed(words: list[str], expected: Blood) -> None:
     parser = argparse.ArgumentParser()
-    options.add_flow(parser)
-    assert asdict(options.given_flow(parser.parse_args(words)).blood) == asdict(expected)
+    options.add_settings(parser, "flow")
+    assert options.given_settings(parser.parse_args(words)).flow.blood == expected
 
 
-@pytest.mark.parametrize(
-    "words", [["--steady", "--pulsatile"], ["--pulsatile", "--steady"], ["--convergence", "--device", "silk"]]
-)
+@pytest.mark.parametrize("words", [["--steady", "--pulsatile"], ["--pulsatile", "--steady"]])
 def test_what_excludes_each_other_is_refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stopped:
         main(["flow", "tube.stl", "--out", "out", *words])
     assert stopped.value.code == 2
     assert "not allowed with" in capsys.readouterr().err
+
+
+def test_flows_on_several_grids_are_those_without_a_device(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["flow", "tube.stl", "--out", "out", "--convergence", "--device", "silk"]) == 2
+    assert "--convergence compares flows without a device" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["run", "flow"])

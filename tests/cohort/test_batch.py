@@ -21,20 +21,26 @@ from vstent import phantoms
 from vstent.cli import main
 from vstent.cohort import batch
 from vstent.cohort.batch import collect, left_to_do, run_cohort
-from vstent.cohort.cases import find_cases
+from vstent.cohort.cases import COLUMNS, find_cases
 from vstent.cohort.estimate import START_CPU_S, estimate
 from vstent.cohort.work import COST, LOST, flat_metrics, read_row, row_path, work
+from vstent.devices.treatment import read_treatment, with_device
 from vstent.errors import FlowError, InputError, ReadError, VstentError
+from vstent.flow.settings import Blood, CarreauYasuda, FlowSettings, Numerics
+from vstent.flow.waveform import OLDER_ADULT_ICA
 from vstent.io.tables import write_parquet
 from vstent.io.writers import write_stl
+from vstent.plan.ranges import Ranges
 from vstent.reporting.cohort import cohort_report, modified_z_scores
 from vstent.study.crews import DaskCluster, Processes, Slurm
 from vstent.study.pipeline import run as run_study
-from vstent.study.types import Placing, Settings
+from vstent.study.settings import AnatomySettings, InputSettings, Settings, settings_of
 
-PLACED = {"enterprise": Placing(center_mm=27.0)}
-"""Within an artery of 44 mm, beyond the end of one of 11 mm that is continued to 31.5 mm."""
-SETTINGS = Settings(devices=("silk", "enterprise"), flow=None, units="mm", placings=PLACED)
+TREATMENTS = (with_device("silk"), with_device("enterprise", center_mm=27.0))
+"""The Enterprise within an artery of 44 mm, beyond the end of one of 11 mm that is continued to 31.5 mm."""
+GIVEN = {"treatment": TREATMENTS, "no-flow": True, "units": "mm"}
+SETTINGS = settings_of(GIVEN)
+USUAL = ("silk", "enterprise")
 
 needs_dask = pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="Dask is not installed")
 
@@ -57,7 +63,7 @@ def scans(tmp_path_factory):
 def table(scans, tmp_path_factory):
     """The cohort's rows, computed one case after another in this process."""
     out = tmp_path_factory.mktemp("alone")
-    cases = find_cases(scans, SETTINGS)
+    cases = find_cases(scans, GIVEN)
     for task in left_to_do(cases, out):
         work(task)
     return bare(collect(cases, out))
@@ -86,8 +92,8 @@ def held(task):
 
 
 def test_the_table_has_a_row_a_case_and_device_with_every_metric_or_the_failure(scans, table, tmp_path):
-    assert [(row["case"], row["device"]) for row in table] == [(c, d) for c in "abc" for d in SETTINGS.devices]
-    by_name = {(row["case"], row["device"]): row for row in table}
+    assert [(row["case"], row["treatment"]) for row in table] == [(c, d) for c in "abc" for d in SETTINGS.devices]
+    by_name = {(row["case"], row["treatment"]): row for row in table}
     study = run_study(scans / "a.stl", tmp_path / "a", SETTINGS, lambda *_: None)
     metrics = json.loads((tmp_path / "a" / "metrics.json").read_text())
     for device in SETTINGS.devices:
@@ -95,7 +101,7 @@ def test_the_table_has_a_row_a_case_and_device_with_every_metric_or_the_failure(
         wanted = json.loads(json.dumps(flat_metrics(metrics, device)))
         assert {key: row[key] for key in wanted} == wanted
         assert row["outcome"] == "done"
-        assert row["sentence"] == study.deployments[device].advice
+        assert row["sentence"] == study.implants[device][device].advice
     assert by_name["b", "silk"]["outcome"] == "done"
     assert by_name["b", "enterprise"]["outcome"] == "failed"
     assert by_name["b", "enterprise"]["stage"] == "deploy enterprise"
@@ -113,16 +119,16 @@ def test_a_device_whose_flow_fails_leaves_the_files_of_the_others(scans, tmp_pat
         return {}, {}
 
     monkeypatch.setattr("vstent.study.pipeline.compute_flows", failing)
-    (case, *_) = find_cases(scans, SETTINGS)
+    (case, *_) = find_cases(scans, GIVEN)
     (task,) = left_to_do([case], tmp_path, keeps_files=True)
     work(task)
     kept = json.loads((task.folder / "study" / "metrics.json").read_text())
-    assert list(kept["stents"]) == ["silk"]
-    assert [path.name for path in (task.folder / "study" / "stents").iterdir()] == ["silk"]
+    assert list(kept["treatments"]) == ["silk"]
+    assert [path.name for path in (task.folder / "study" / "treatments").iterdir()] == ["silk"]
 
 
 def test_a_worker_killed_midway_is_replaced_and_the_table_is_the_same(scans, table, tmp_path):
-    cases = find_cases(scans, SETTINGS)
+    cases = find_cases(scans, GIVEN)
     victims = []
 
     def kill_one():
@@ -146,7 +152,7 @@ def test_a_case_whose_process_always_dies_costs_only_itself_and_is_done_by_the_n
     scans, table, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(batch, "work", killed)
-    cases = find_cases(scans, SETTINGS)[1:]
+    cases = find_cases(scans, GIVEN)[1:]
     run_cohort(left_to_do(cases, tmp_path), tmp_path, Processes(2), told)
     rows = collect(cases, tmp_path)
     assert [row["outcome"] for row in rows] == ["done", "failed", LOST, LOST]
@@ -159,10 +165,10 @@ def test_a_case_whose_process_always_dies_costs_only_itself_and_is_done_by_the_n
 
 
 def test_a_second_run_does_only_what_is_missing(scans, table, tmp_path):
-    cases = find_cases(scans, SETTINGS)
+    cases = find_cases(scans, GIVEN)
     for case in cases:
         for device, key in case.keys.items():
-            row = next(row for row in table if (row["case"], row["device"]) == (case.name, device))
+            row = next(row for row in table if (row["case"], row["treatment"]) == (case.name, device))
             path = row_path(tmp_path / "cases" / case.name, device)
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(json.dumps({"key": key, "row": row}))
@@ -170,7 +176,8 @@ def test_a_second_run_does_only_what_is_missing(scans, table, tmp_path):
     # one row damaged, one input changed, one more device: just these are missing
     row_path(tmp_path / "cases" / "a", "silk").write_text('{"key": ')
     changed = [replace(case, path=scans / "a.stl") if case.name == "b" else case for case in cases]
-    more = [replace(c, devices=("silk", "enterprise", "pipeline")) for c in changed]
+    treatments = (*TREATMENTS, with_device("pipeline"))
+    more = [replace(c, settings=replace(c.settings, treatments=treatments)) for c in changed]
     missing = {task.case.name: task.case.settings.devices for task in left_to_do(more, tmp_path)}
     assert missing == {
         "a": ("silk", "pipeline"),
@@ -178,27 +185,28 @@ def test_a_second_run_does_only_what_is_missing(scans, table, tmp_path):
         "c": ("pipeline",),
     }
     # another threshold is another study
-    other = [replace(cases[0], settings=replace(SETTINGS, threshold=100.0))]
+    other = [replace(cases[0], settings=replace(SETTINGS, input=InputSettings("mm", threshold=100.0)))]
     assert left_to_do(other, tmp_path)[0].case.settings.devices == SETTINGS.devices
 
 
 def test_the_command_writes_the_table_twice_and_a_report(scans, table, tmp_path, capsys):
     out = tmp_path / "out"
     listed = tmp_path / "cohort.csv"
-    listed.write_text(f"case,input,devices,at\nfirst,{scans / 'a.stl'},silk,\nlast,{scans / 'c.stl'},,\n")
+    listed.write_text(f"case,input,device,at\nfirst,{scans / 'a.stl'},silk,\nlast,{scans / 'c.stl'},,\n")
     command = ["batch", str(listed), "--out", str(out), "--no-flow", "--units", "mm", "--device", "enterprise"]
     assert main([*command, "--jobs", "2", "--keep-files"]) == 0
     said = capsys.readouterr()
     assert "2 cases, 2 rows; 2 cases to do: about 1 min" in said.out
     with (out / "cohort.csv").open(newline="") as file:
         first, last = csv.DictReader(file)
-    assert (first["case"], first["device"], first["outcome"]) == ("first", "silk", "done")
-    assert (last["device"], last["outcome"], last["stage"]) == ("enterprise", "failed", "segment")
-    alone = next(row for row in table if (row["case"], row["device"]) == ("a", "silk"))
-    key = "deployment.deployed_length_mm"
+    assert (first["case"], first["treatment"], first["outcome"]) == ("first", "silk", "done")
+    assert (last["treatment"], last["outcome"], last["stage"]) == ("enterprise", "failed", "segment")
+    alone = next(row for row in table if (row["case"], row["treatment"]) == ("a", "silk"))
+    key = "implant.deployed_length_mm"
     assert float(first[key]) == pytest.approx(alone[key], rel=1e-5)
     study = json.loads((out / "cases" / "first" / "study" / "metrics.json").read_text())
-    assert study["stents"]["silk"]["deployment"]["deployed_length_mm"] == pytest.approx(alone[key], rel=1e-5)
+    (implant,) = study["treatments"]["silk"]["implants"].values()
+    assert implant["deployed_length_mm"] == pytest.approx(alone[key], rel=1e-5)
     page = (out / "cohort.html").read_text()
     assert last["sentence"] in page.replace("&#39;", "'")
     assert re.findall(r'alt="(.*?)"', page) == ["silk in the artery of first"]  # the other case has no device
@@ -216,21 +224,29 @@ def test_parquet_holds_what_the_rows_hold(table, tmp_path):
 BAD_LISTS = {
     "an unknown column": ("input,sac\na.stl,1\n", "column 'sac'"),
     "no input": ("case\nfirst\n", "has no input"),
-    "a point of two numbers": ("input,at\na.stl,1 2\n", "three numbers"),
-    "a threshold in words": ("input,threshold\na.stl,high\n", "threshold is 'high'"),
+    "a point of two numbers": ("input,at\na.stl,1 2\n", "column at: '1 2' is not 3 numbers"),
+    "a threshold in words": ("input,threshold\na.stl,high\n", "column threshold: 'high' is not a number"),
     "a threshold that is no number": ("input,threshold\na.stl,500\na.stl,nan\n", "line 3 of"),
-    "an endless size": ("input,diameter\na.stl,inf\n", "diameter is 'inf', which cannot be used: a finite number"),
-    "a point that is nowhere": ("input,at\na.stl,1 nan 3\n", "at is '1 nan 3', which cannot be used: a finite"),
-    "a size below zero": ("input,length\na.stl,-4\n", "length is '-4', which cannot be used: it must be above zero"),
-    "half an inlet": ("input,inlet\na.stl,1 2 3; 4\n", "inlet is '1 2 3; 4', which cannot be used: three numbers"),
-    "voxels without an edge": ("input,spacing\na.raw,0.1 0 1\n", "spacing is '0.1 0 1', which cannot be used: it must"),
-    "no voxels": ("input,shape\na.raw,10 0 10\n", "shape is '10 0 10', which cannot be used: it must"),
-    "a unit of fields": ("input,units\na.stl,furlong\n", "units is 'furlong', which cannot be used: give one of m, cm"),
+    "an endless size": ("input,diameter\na.stl,inf\n", "column diameter: 'inf' is not a number"),
+    "a point that is nowhere": ("input,at\na.stl,1 nan 3\n", "column at: '1 nan 3' is not 3 numbers"),
+    "a size below zero": (
+        "input,length\na.stl,-4\n",
+        "column length: -4 mm is out of range: give above 0, up to 1000 mm",
+    ),
+    "half an inlet": ("input,inlet\na.stl,1 2 3; 4\n", "column inlet: '4' is not 3 numbers"),
+    "voxels without an edge": ("input,spacing\na.raw,0.1 0 1\n", "column spacing: 0 mm is out of range"),
+    "no voxels": ("input,shape\na.raw,10 0 10\n", "column shape: 0 is out of range: give 1 to 100000"),
+    "a unit of fields": ("input,units\na.stl,furlong\n", "column units: 'furlong' is not one of m, cm, mm"),
+    "a flag that is neither": ("input,gpu\na.stl,maybe\n", "column gpu: 'maybe' is not yes or no"),
+    "a treatment of nothing": ("input,treatment\na.stl,+\n", "column treatment: '' is not an implant"),
+    "a neck that is nowhere": ("input,neck\na.stl,neck.csv\n", "list.csv: "),
+    "a range of nothing": ("input,vary-landing\na.stl,2\n", "list.csv: --vary-landing needs --uncertainty N"),
+    "an unknown engine": ("input,engine,no-flow\na.stl,steam,no\n", "There is no 'steam'"),
     "a name with a slash": ("case,input\n../up,a.stl\n", "without slashes"),
     "one name twice": ("case,input\nx,a.stl\nx,b.stl\n", "two cases called x"),
     "no case at all": ("case,input\n", "holds no case"),
-    "one device twice": ("input,devices\na.stl,silk silk\n", "list.csv: two treatments are called silk"),
-    "a device that does not exist": ("input,devices\na.stl,slik\n", "silk"),
+    "one device twice": ("input,device\na.stl,silk silk\n", "list.csv: two treatments are called silk"),
+    "a device that does not exist": ("input,device\na.stl,slik\n", "silk"),
 }
 
 
@@ -243,36 +259,94 @@ def test_a_bad_list_is_refused_before_anything_is_done(name, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_list_says_what_each_case_is_told(tmp_path):
-    (tmp_path / "list.csv").write_text(
-        "input,units,threshold,at,inlet,spacing,shape,diameter,center\n"
-        'a.stl,cm,-5.5,"-1.5, 0; 3",1 2 3; 4 5 -6,0.1 0.2 0.3,5 6 7,4.5,-2\nb.stl,,,,,,,,\n'
-    )
-    first, second = find_cases(tmp_path / "list.csv", SETTINGS)
-    told = {"units": "cm", "threshold": -5.5, "at_mm": (-1.5, 0.0, 3.0), "spacing_mm": (0.1, 0.2, 0.3)}
-    told |= {"inlet_mm": ((1.0, 2.0, 3.0), (4.0, 5.0, -6.0)), "shape": (5, 6, 7), "diameter_mm": 4.5, "center_mm": -2.0}
-    assert first.settings.__dict__ == replace(SETTINGS, **told).__dict__
-    assert second.settings.__dict__ == SETTINGS.__dict__
+CELLS = {
+    "units": ("cm", Settings(InputSettings(units="cm"))),
+    "frame": ("ras", Settings(InputSettings(frame="ras"))),
+    "acquisition": ("2", Settings(InputSettings(acquisition=2))),
+    "spacing": ("0.1 0.2 0.3", Settings(InputSettings(spacing_mm=(0.1, 0.2, 0.3)))),
+    "shape": ("5 6 7", Settings(InputSettings(shape=(5, 6, 7)))),
+    "crop": ("0 0 0 1 2 3", Settings(InputSettings(crop_mm=((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))))),
+    "threshold": ("-5.5", Settings(InputSettings(threshold=-5.5))),
+    "at": ('"-1.5, 0; 3"', Settings(anatomy=AnatomySettings(at_mm=(-1.5, 0.0, 3.0)))),
+    "inlet": ("1 2 3; 4 5 -6", Settings(anatomy=AnatomySettings(inlet_mm=((1.0, 2.0, 3.0), (4.0, 5.0, -6.0))))),
+    "outlet": ("1 2 3", Settings(anatomy=AnatomySettings(outlet_mm=(1.0, 2.0, 3.0)))),
+    "neck": ("neck.csv", Settings(anatomy=AnatomySettings(neck_mm=((1.0, 2.0, 3.0), (4.0, 5.0, 6.0))))),
+    "upstream": ("9", Settings(anatomy=AnatomySettings(upstream_mm=9.0))),
+    "downstream": ("8", Settings(anatomy=AnatomySettings(downstream_mm=8.0))),
+    "treatment": (
+        "two=silk 4x20 + silk@-4; pipeline",
+        Settings(treatments=(read_treatment("two=silk 4x20 + silk@-4"), with_device("pipeline"))),
+    ),
+    "device": ("silk pipeline", Settings(treatments=(with_device("silk"), with_device("pipeline")))),
+    "diameter": ("4.5", Settings(treatments=tuple(with_device(one, diameter_mm=4.5) for one in USUAL))),
+    "length": ("20", Settings(treatments=tuple(with_device(one, length_mm=20.0) for one in USUAL))),
+    "center": ("-2", Settings(treatments=tuple(with_device(one, center_mm=-2.0) for one in USUAL))),
+    "no-flow": ("yes", Settings(flow=None)),
+    "flow-rate": ("4.5", Settings(flow=FlowSettings(inflow_mL_s=4.5))),
+    "density": ("1050", Settings(flow=FlowSettings(blood=Blood(1050.0)))),
+    "viscosity": ("0.0035", Settings(flow=FlowSettings(blood=Blood(viscosity_Pa_s=0.0035)))),
+    "shear-thinning": ("yes", Settings(flow=FlowSettings(blood=Blood(1060.0, 0.00345, CarreauYasuda())))),
+    "pulsatile": ("published", Settings(flow=FlowSettings(waveform=OLDER_ADULT_ICA))),
+    "steady": ("yes", Settings()),
+    "outlets": ("murray", Settings(flow=FlowSettings(outlets="murray"))),
+    "grid-spacing": ("0.2", Settings(flow=FlowSettings(numerics=Numerics(cell_size_mm=0.2)))),
+    "refine-sac": ("true", Settings(flow=FlowSettings(numerics=Numerics(close_up=True)))),
+    "engine": ("openfoam", Settings(flow=FlowSettings(numerics=Numerics(engine="openfoam")))),
+    "processes": ("2", Settings(flow=FlowSettings(numerics=Numerics(processes=2)))),
+    "gpu": ("no", Settings()),
+    "uncertainty": ("8", Settings(uncertainty=Ranges(8))),
+    "uncertainty-flows": ("2", Settings(uncertainty=Ranges(8, 2))),
+    "vary-threshold": ("0.2", Settings(uncertainty=Ranges(8, threshold_mm=0.2))),
+    "vary-landing": ("2", Settings(uncertainty=Ranges(8, landing_mm=2.0))),
+    "vary-device": ("0", Settings(uncertainty=Ranges(8, device_mm=0.0))),
+    "vary-inflow": ("0.1", Settings(uncertainty=Ranges(8, inflow_fraction=0.1))),
+    "vary-numbers": ("0.5", Settings(uncertainty=Ranges(8, numbers_factor=0.5))),
+}
+"""A cell of every column, and the settings that it gives where nothing else is stated."""
+
+
+@pytest.mark.parametrize("column", COLUMNS)
+def test_every_option_is_a_column_that_reaches_its_setting(column, tmp_path):
+    if column in ("case", "input"):
+        return
+    (tmp_path / "neck.csv").write_text("1,2,3\n4,5,6\n")
+    cell, expected = CELLS[column]
+    (tmp_path / "list.csv").write_text(f"case,input,{column}\nfirst,a.stl,{cell}\nlast,a.stl,\n")
+    given = {"uncertainty": 8} if column.startswith(("vary", "uncertainty-")) else {}
+    given |= {"pulsatile": "published"} if column == "steady" else {}
+    given |= {"gpu": False, "no-flow": False}
+    first, last = find_cases(tmp_path / "list.csv", given)
+    assert first.settings == expected
+    assert last.settings == settings_of(given)  # an empty cell takes what holds for all
+    assert first.settings != last.settings or column == "gpu"
+
+
+def test_a_row_joins_what_it_states_to_what_holds_for_all(tmp_path):
+    """Points are in the frame of the row, and sizes belong to the devices for all."""
+    (tmp_path / "list.csv").write_text("input,frame,at,length\na.stl,ras,1 2 3,18\n")
+    (found,) = find_cases(tmp_path / "list.csv", {"device": ["silk"], "diameter": 4.0, "outlet": (4.0, 5.0, 6.0)})
+    assert found.settings.treatments == (with_device("silk", diameter_mm=4.0, length_mm=18.0),)
+    assert found.settings.anatomy == AnatomySettings(at_mm=(-1.0, -2.0, 3.0), outlet_mm=(-4.0, -5.0, 6.0))
 
 
 def test_a_folder_holds_its_surfaces_scans_and_series(scans, tmp_path):
-    assert [case.name for case in find_cases(scans, SETTINGS)] == ["a", "b", "c"]
+    assert [case.name for case in find_cases(scans, GIVEN)] == ["a", "b", "c"]
     series = tmp_path / "cohort" / "patient 1"
     series.mkdir(parents=True)
     (series / "IM0001").write_bytes(b"")
     (tmp_path / "cohort" / "empty").mkdir()
     (tmp_path / "cohort" / "two.nii.gz").write_bytes(b"")
-    assert [case.name for case in find_cases(tmp_path / "cohort", SETTINGS)] == ["patient 1", "two"]
+    assert [case.name for case in find_cases(tmp_path / "cohort", GIVEN)] == ["patient 1", "two"]
     with pytest.raises(ReadError, match="does not exist"):
-        find_cases(tmp_path / "none", SETTINGS)
+        find_cases(tmp_path / "none", GIVEN)
 
 
 def test_an_estimate_grows_with_cases_devices_and_flow_and_heeds_memory(scans, monkeypatch):
-    cases = find_cases(scans, SETTINGS)
+    cases = find_cases(scans, GIVEN)
     one, all_three = estimate(cases[:1], 2), estimate(cases, 2)
     assert one.cpu_s > START_CPU_S
     assert all_three.cpu_s > 2 * one.cpu_s
-    flowing = [replace(case, settings=Settings(units="mm")) for case in cases]
+    flowing = [replace(case, settings=replace(SETTINGS, flow=FlowSettings())) for case in cases]
     assert estimate(flowing, 2).cpu_s > 10 * all_three.cpu_s
     monkeypatch.setattr(sys.modules["vstent.cohort.estimate"], "_free_memory_MB", lambda: 3.5 * one.memory_MB)
     assert estimate(cases[:1], 8).jobs == 3
@@ -297,7 +371,7 @@ def test_outliers_are_found_by_the_modified_z_score():
 def test_a_dask_worker_killed_midway_gives_the_same_table_and_a_lost_scheduler_keeps_what_is_done(
     scans, table, tmp_path, monkeypatch
 ):
-    cases = find_cases(scans, SETTINGS)
+    cases = find_cases(scans, GIVEN)
     with Scheduler(tmp_path) as scheduler:
         scheduler.add_worker()
         victim = scheduler.add_worker()
@@ -322,7 +396,7 @@ def test_a_dask_worker_killed_midway_gives_the_same_table_and_a_lost_scheduler_k
 def test_no_scheduler_is_told_in_a_sentence(scans, tmp_path, monkeypatch):
     monkeypatch.setattr("vstent.study.crews.SCHEDULER_S", 0.5)
     with pytest.raises(InputError, match="No Dask scheduler answers"):
-        list(DaskCluster("tcp://127.0.0.1:9").do(work, left_to_do(find_cases(scans, SETTINGS), tmp_path)))
+        list(DaskCluster("tcp://127.0.0.1:9").do(work, left_to_do(find_cases(scans, GIVEN), tmp_path)))
 
 
 def test_a_slurm_job_asks_for_twice_the_memory_foreseen_and_holds_one_case():
@@ -362,7 +436,7 @@ def test_slurm_jobs_that_the_queue_ends_are_asked_for_anew(scans, table, tmp_pat
         (tmp_path / name).chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
     monkeypatch.chdir(tmp_path)
-    cases = find_cases(scans, SETTINGS)
+    cases = find_cases(scans, GIVEN)
 
     def ended(done, *_):
         if done == 1:

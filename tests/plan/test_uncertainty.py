@@ -22,8 +22,9 @@ from vstent.geometry.vessel import Vessel
 from vstent.io.writers import write_stl
 from vstent.phantoms import demo_phantom, phantom_surface
 from vstent.plan import uncertainty
+from vstent.plan.ranges import Ranges
 from vstent.plan.shares import first_order_shares
-from vstent.plan.uncertainty import CAUSES, Ranges, vary
+from vstent.plan.uncertainty import CAUSES, vary
 from vstent.plan.widening import widened
 from vstent.study.folder import CACHE
 from vstent.study.store import Unfinished
@@ -156,7 +157,9 @@ def test_the_numbers_of_the_device_vary_within_their_ranges():
     assert vary(artery(), lies, Ranges(2, numbers_factor=0.0, **still)).interval("deployed_length_mm")[1:] == (
         pytest.approx(2 * (lies.stent.deployed_length_mm,), rel=1e-9)
     )
-    (half,) = (one for one in Ranges(numbers_factor=0.5).numbers_of(design) if one.name == "braid_angle_rad")
+    (half,) = (
+        one for one in uncertainty.numbers_of(Ranges(numbers_factor=0.5), design) if one.name == "braid_angle_rad"
+    )
     (whole,) = (one for one in uncertain(design) if one.name == "braid_angle_rad")
     middle = design.angle_rad
     assert (half.low, half.high) == pytest.approx(((middle + whole.low) / 2, (middle + whole.high) / 2))
@@ -166,12 +169,12 @@ def test_the_numbers_of_the_device_vary_within_their_ranges():
     ("given", "said"),
     [
         ({"samples": 1}, "at least 2"),
-        ({"flow_samples": -1}, "and 0 or more flows"),
+        ({"flow_samples": -1}, "flow_samples of an uncertainty study: -1 is out of range: give at least 0"),
         ({"landing_mm": -1.0}, "landing_mm"),
         ({"landing_mm": float("nan")}, "landing_mm"),
         ({"threshold_mm": float("inf")}, "threshold_mm"),
         ({"device_mm": -0.1}, "device_mm"),
-        ({"inflow_fraction": 1.0}, "less than 1"),
+        ({"inflow_fraction": 1.0}, "give 0 to 0.99"),
         ({"numbers_factor": 1.5}, "give 0 to 1"),
     ],
 )
@@ -194,11 +197,8 @@ def test_a_threshold_that_would_close_the_artery_is_refused():
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--uncertainty", "1"], "at least 2"),
-        (["--uncertainty", "8", "--uncertainty-flows", "-1"], "and 0 or more flows"),
-        (["--uncertainty", "8", "--vary", "landing=nan"], "landing_mm"),
-        (["--vary", "landing=2"], "--uncertainty N"),
-        (["--uncertainty-flows", "2"], "--uncertainty N"),
+        (["--vary-landing", "2"], "--vary-landing needs --uncertainty N"),
+        (["--uncertainty-flows", "2"], "--uncertainty-flows needs --uncertainty N"),
     ],
 )
 def test_the_command_refuses_them_before_anything_is_read(words, said, tmp_path, capsys):
@@ -276,14 +276,14 @@ def test_a_study_tells_its_uncertainty_in_metrics_report_and_table_and_goes_on_f
     write_stl(tmp_path / "a.stl", phantom_surface(demo_phantom(), edge_mm=0.4))
     out = tmp_path / "out"
     command = ["run", str(tmp_path / "a.stl"), "--out", str(out), "--units", "mm", "--device", "enterprise"]
-    command += ["--no-flow", "--uncertainty", "8", "--vary", "threshold=0.2", "--vary", "landing=2"]
+    command += ["--no-flow", "--uncertainty", "8", "--vary-threshold", "0.2", "--vary-landing", "2"]
     assert main(command) == 0
     said = capsys.readouterr().out
     assert "causes" in said
-    stent = json.loads((out / "metrics.json").read_text())["stents"]["enterprise"]
-    assert stent["uncertainty"]["ranges"]["landing_mm"] == 2.0
-    interval = stent["uncertainty"]["intervals"]["deployed_length_mm"]
-    assert interval["low"] < stent["deployment"]["deployed_length_mm"] < interval["high"]
+    treatment = json.loads((out / "metrics.json").read_text())["treatments"]["enterprise"]
+    assert treatment["uncertainty"]["ranges"]["landing_mm"] == 2.0
+    interval = treatment["uncertainty"]["intervals"]["deployed_length_mm"]
+    assert interval["low"] < treatment["implants"]["enterprise"]["deployed_length_mm"] < interval["high"]
     page = (out / "report.html").read_text()
     section = page[page.index('<section id="uncertainty">') : page.index('<section id="notes">')]
     assert "all diameters ±0.200\u202fmm" in section
@@ -295,8 +295,18 @@ def test_a_study_tells_its_uncertainty_in_metrics_report_and_table_and_goes_on_f
     assert (out / "metrics.json").read_bytes() == before
 
 
-@pytest.mark.parametrize("text", ["landing", "landing=x", "weather=1"])
-def test_causes_are_checked(text, capsys):
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--uncertainty", "1"], "--uncertainty: 1 is out of range: give at least 2"),
+        (["--uncertainty-flows", "-1"], "--uncertainty-flows: -1 is out of range: give at least 0"),
+        (["--vary-landing", "nan"], "--vary-landing: 'nan' is not a number"),
+        (["--vary-device", "-1"], "--vary-device: -1 mm is out of range: give at least 0 mm"),
+        (["--vary-inflow", "1"], "--vary-inflow: 1 is out of range: give 0 to 0.99"),
+        (["--vary-weather", "1"], "unrecognized"),
+    ],
+)
+def test_causes_are_checked(words, said, capsys):
     with pytest.raises(SystemExit):
-        main(["run", "a.stl", "--out", "out", "--vary", text])
-    assert "--vary" in capsys.readouterr().err
+        main(["run", "a.stl", "--out", "out", *words])
+    assert said in capsys.readouterr().err

@@ -17,7 +17,7 @@ import json, pathlib, sys
 from vstent.flow.case import FlowSettings
 from vstent.reporting import write
 from vstent.study.pipeline import run
-from vstent.study.types import Settings
+from vstent.study.settings import Settings
 
 path, out = map(pathlib.Path, sys.argv[1:])
 computed, told = [], []

@@ -16,11 +16,12 @@ from vstent.cli import main
 from vstent.flow.settings import FlowSettings
 from vstent.flow.waveform import OLDER_ADULT_ICA
 from vstent.io.writers import write_json, write_stl
-from vstent.plan.uncertainty import Ranges
+from vstent.plan.ranges import Ranges
 from vstent.study import repeat as repeating
 from vstent.study.crate import write_crate
 from vstent.study.repeat import agreement
-from vstent.study.types import Placing, Settings
+from vstent.study.settings import Settings
+from vstent.study.types import Placing
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +32,7 @@ def case(tmp_path_factory):
     write_stl(folder / "ä scan.stl", phantoms.phantom_surface(artery, edge_mm=0.45))
     options = ["--units", "mm", "--device", "silk", "--at=0.1234567891,3,12", "--center", "12.000000123"]
     flow = ["--grid-spacing", "0.333333333333", "--flow-rate", "2.7182818284590"]
-    varied = ["--uncertainty", "2", "--vary", "landing=0.1"]
+    varied = ["--uncertainty", "2", "--vary-landing", "0.1"]
     command = ["run", str(folder / "ä scan.stl"), "--out", str(folder / "first"), *options, *flow, *varied]
     assert main(command) == 0
     return folder
@@ -44,11 +45,13 @@ def test_a_repeated_run_is_the_same_to_the_last_bit(case, capsys):
     assert "Not as then" not in said.err
     assert "already done" not in said.err
     first, again = case / "first", case / "again"
-    for name in ("metrics.json", "vessel.vtp", "stents/silk/wires.vtp", "flow/silk/wall.vtp", "flow/bare/field.vtu"):
+    of_silk = ("treatments/silk/implants/silk/wires.vtp", "treatments/silk/flow/wall.vtp")
+    for name in ("metrics.json", "vessel.vtp", *of_silk, "treatments/bare/flow/field.vtu"):
         assert (first / name).read_bytes() == (again / name).read_bytes()
     one, other = (json.loads((folder / "run.json").read_text()) for folder in (first, again))
     assert one["settings"] == other["settings"]
-    assert one["settings"]["center_mm"] == 12.000000123
+    (treatment,) = one["settings"]["treatments"]
+    assert treatment["implants"][0]["placing"]["position_mm"] == 12.000000123
     assert one["settings"]["flow"]["numerics"]["cell_size_mm"] == 0.333333333333
     _check_crate(again)
 
@@ -120,14 +123,48 @@ def test_a_record_takes_no_other_settings_nor_its_own_folder(case, capsys):
     assert "another --out" in capsys.readouterr().err
 
 
+ALL = Settings(
+    InputSettings("cm", "ras", 2, (0.1, 0.2, 1 / 3), (5, 6, 7), ((0.0, 0.1, 0.2), (1.0, 2.0, 3.0)), 1e-3),
+    AnatomySettings((0.1, 1e-17, -2 / 3), ((1.0, 2.0, 3.0), (4.0, 5.0, 6.0)), (7.0, 8.0, 9.0), ((0.0, 0.0, 1.0),), 9.5, 8.5),
+    (
+        Treatment(
+            "two",
+            (
+                Implant("a", "silk", 4.0, 20.0, Placing("outlet_2", 1 / 3, "distal")),
+                Implant("b", "silk", placing=Placing(shift_mm=-4.0), inside=("a",)),
+            ),
+            has_flow=False,
+        ),
+    ),
+    FlowSettings(
+        1 / 3,
+        Blood(1050.0, 0.0035, CarreauYasuda(0.05, 2.0, 1.3, 0.3)),
+        OLDER_ADULT_ICA,
+        "murray",
+        Numerics(0.2, True, 20.0, 1e5, 0.02, 9000, 3, 0.03, 0.1, "openfoam", 2, True),
+    ),
+    Ranges(7, 2, 0.1, 0.2, 0.3, 0.4, 0.5),
+)
+"""Settings of which every one differs from its default."""
+
+
+def changed(one: Any, path: str = "") -> list[str]:
+    """The paths of all settings in data classes that have another value than their default."""
+    found = []
+    for field in fields(one):
+        value = getattr(one, field.name)
+        for k, nested in enumerate(value if isinstance(value, tuple) else (value,)):
+            if is_dataclass(nested):
+                found += changed(nested, f"{path}{field.name}.{k}.")
+        if field.default is MISSING or value != field.default:
+            found.append(f"{path}{field.name}")
+    return found
+
+
 def test_settings_come_back_from_json_to_the_last_bit(tmp_path):
-    flow = FlowSettings(inflow_mL_s=1 / 3, waveform=OLDER_ADULT_ICA, outlets="murray")
-    settings = Settings(
-        devices=("silk",), at_mm=(0.1, 1e-17, -2 / 3), flow=flow, placings={"silk": Placing(4.0)}, uncertainty=Ranges(7)
-    )
-    write_json(tmp_path / "s.json", asdict(settings), is_exact=True)
-    back = repeating.settings_of(json.loads((tmp_path / "s.json").read_text()))
-    assert asdict(back) == asdict(settings)
+    unchanged = {path for path, one in zip(everything(ALL), everything(ALL), strict=True)}
+    write_json(tmp_path / "s.json", asdict(ALL), is_exact=True)
+    assert repeating.settings_of(json.loads((tmp_path / "s.json").read_text())) == ALL
 
 
 @pytest.mark.parametrize(

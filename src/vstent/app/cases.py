@@ -20,7 +20,7 @@ from vstent.io.files import atomic
 from vstent.study.folder import refuse_older
 
 if TYPE_CHECKING:  # imported when a study's settings are needed, as in `vstent.app.choices`
-    from vstent.study.types import Settings
+    from vstent.study.settings import Settings
 
 STATE: Final = "app.json"
 """File of a case folder that stores the page's state."""
@@ -82,7 +82,7 @@ class State(BaseModel):
             They belong to a study of another version.
         """
         from vstent.study.repeat import settings_of
-        from vstent.study.types import Settings
+        from vstent.study.settings import Settings
 
         try:
             return settings_of(self.former) if self.former else Settings()
@@ -97,7 +97,7 @@ class State(BaseModel):
 
     def unseen(self) -> list[str]:
         """Return the settings, with their values, that the page cannot change and that differ from its own."""
-        from vstent.study.types import Settings
+        from vstent.study.settings import Settings
 
         return list(_differences(asdict(self.settings()), asdict(self.choices.settings(Settings()))))
 

@@ -8,8 +8,9 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from vstent.devices.treatment import Treatment, with_device
 
 if TYPE_CHECKING:  # imported only when the settings of a study are needed, so that the page appears at once
-    from vstent.flow.settings import FlowSettings, Waveform
-    from vstent.study.types import AnatomySettings, InputSettings, Settings
+    from vstent.flow.settings import FlowSettings
+    from vstent.flow.waveform import Waveform
+    from vstent.study.settings import AnatomySettings, InputSettings, Settings
 
 Part = TypeVar("Part", "InputSettings", "AnatomySettings")
 
@@ -148,7 +149,7 @@ class Choices(Strict):
     def settings(self, former: "Settings") -> "Settings":
         """Return the settings of the study; settings that the page cannot change are taken from `former`."""
         from vstent.flow.settings import FlowSettings
-        from vstent.plan.uncertainty import Ranges
+        from vstent.plan.ranges import Ranges
 
         samples = self.uncertainty_samples
         return replace(

@@ -8,7 +8,7 @@ from vstent.app.cases import State, dependencies
 from vstent.errors import InputError
 
 if TYPE_CHECKING:  # imported when a folder is read, as in `vstent.app.choices`
-    from vstent.study.types import Settings
+    from vstent.study.settings import Settings
 
 RUN: Final = "run.json"
 """File in which a study states its settings."""

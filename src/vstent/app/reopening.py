@@ -14,7 +14,7 @@ from vstent.errors import ReadError
 from vstent.io.files import suffix
 
 if TYPE_CHECKING:  # loaded when a folder is opened, as in `vstent.app.choices`
-    from vstent.study.types import Settings
+    from vstent.study.settings import Settings
 
 FLOW: Final = ("inflow_mL_s", "outlets")
 """Settings of the flow that the page can change, besides grid spacing and waveform."""

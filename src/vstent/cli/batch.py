@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from vstent.cli import options, run
+from vstent.cli import options
 
 
 def add(commands: options.Commands) -> None:
@@ -16,12 +16,15 @@ def add(commands: options.Commands) -> None:
         "Run many cases with every device, and write one table and a cohort report.",
         "batch cohort/ --device silk --no-flow --out study --jobs 2",
     )
-    parser.add_argument("cohort", type=Path, help="folder of scans or surfaces, or a CSV file with a column `input`")
+    parser.add_argument(
+        "cohort",
+        type=Path,
+        help="folder of scans or surfaces, or a CSV file with a column `input`, and columns named like options",
+    )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="output folder; a folder that exists is continued"
     )
-    options.add_outlet(options.add_given(parser))
-    run.add_study(parser)
+    options.add_settings(parser, *options.VESSEL, *options.STUDY)
     working = parser.add_argument_group("parallel work")
     options.add_crew(working)
     working.add_argument(
@@ -38,8 +41,7 @@ def _batch(arguments: argparse.Namespace) -> int:
     from vstent.cohort.estimate import estimate
 
     console = Console()
-    settings = run.given_study(arguments)
-    cases = find_cases(arguments.cohort, settings)
+    cases = find_cases(arguments.cohort, options.given(arguments))
     tasks = left_to_do(cases, arguments.out, keeps_files=arguments.keep_files)
     foreseen = estimate([task.case for task in tasks], arguments.jobs)
     console.print(f"{len(cases)} cases, {row_count(cases)} rows; {len(tasks)} cases to do: {foreseen.sentence}.")

@@ -20,7 +20,7 @@ def add(commands: options.Commands) -> None:
         action="store_true",
         help="replace results in the folder that belong to other settings (default: refuse)",
     )
-    run.add_study(parser)
+    options.add_settings(parser, *options.STUDY)
     run.add_pdf(parser)
     parser.set_defaults(command=_demo, answered=finished.answered)
 
@@ -30,7 +30,7 @@ def _demo(arguments: argparse.Namespace) -> int:
     from vstent.cli.console import Console, truth_table
     from vstent.study.demo import truth, write_scan
 
-    scan, settings = write_scan(arguments.out / "scan"), run.given_study(arguments)
+    scan, settings = write_scan(arguments.out / "scan"), options.given_settings(arguments)
     before = finished.begun(arguments, scan)
     console, asked = Console(), {"is_printed": arguments.pdf, "replaces": arguments.replace}
     case = run.study(scan, arguments.out, settings, console, **asked)

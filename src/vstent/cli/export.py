@@ -5,6 +5,7 @@ from pathlib import Path
 
 from vstent.cli import options
 from vstent.errors import InputError
+from vstent.fields import Option, whole
 
 
 def add(commands: options.Commands) -> None:
@@ -20,16 +21,14 @@ def add(commands: options.Commands) -> None:
         "export openfoam case --device silk --out foam",
     )
     _add_input(foam)
-    options.add_treatments(foam)
-    options.add_problem(foam)
+    unsupported = ("no-flow", "engine", "refine-sac", "gpu")
+    options.add_settings(foam, *options.VESSEL, "treatments", "flow", without=unsupported)
     group = foam.add_argument_group("OpenFOAM")
-    options.add_processes(group)
     group.add_argument(
         "--flavour", choices=("com", "org"), help="openfoam.com or openfoam.org (default: the one installed, else com)"
     )
-    group.add_argument(
-        "--layers", type=_layers, default=2, metavar="N", help="prism layers along the wall (default: 2)"
-    )
+    layers = Option("layers", "prism layers along the wall", whole, metavar="N", low=0, usual="2")
+    options.add_option(group, layers, default=2)
     foam.set_defaults(command=_openfoam)
     patches = options.add_command(
         kinds,
@@ -38,37 +37,27 @@ def add(commands: options.Commands) -> None:
         "export patches case --out patches",
     )
     _add_input(patches)
+    options.add_settings(patches, *options.VESSEL)
     patches.set_defaults(command=_patches)
 
 
 def _add_input(parser: argparse.ArgumentParser) -> None:
-    """Add input, output folder and the options on the vessel."""
+    """Add input and output folder."""
     parser.add_argument("input", type=Path, help="case folder of `vstent run`, scan or surface")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="output folder")
-    options.add_outlet(options.add_given(parser))
-
-
-def _layers(text: str) -> int:
-    """Return a number of prism layers read from text."""
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of layers: give 0 or more")
-    return int(text)
 
 
 def _openfoam(arguments: argparse.Namespace) -> int:
     """Run ``export openfoam``; return the exit code."""
     from vstent.cli.console import Console
     from vstent.study.exports import export_openfoam
-    from vstent.study.types import Settings
 
-    treatments = options.given_treatments(arguments, usual=())
-    if len(treatments) > 1:
+    settings = options.given_settings(arguments, device=())
+    if len(settings.treatments) > 1:
         raise InputError(
             "A case folder of OpenFOAM holds the wires of one treatment: give one --device or --treatment."
         )
-    flow = options.given_problem(arguments)
-    settings = Settings(**options.given_geometry(arguments), treatments=treatments, flow=flow)
-    foam = {"processes": arguments.processes, "layers": arguments.layers}
+    foam = {"layers": arguments.layers}
     if arguments.flavour:
         foam["flavour"] = arguments.flavour
     console = Console()
@@ -82,10 +71,8 @@ def _patches(arguments: argparse.Namespace) -> int:
     """Run ``export patches``; return the exit code."""
     from vstent.cli.console import Console
     from vstent.study.exports import export_patches
-    from vstent.study.types import Settings
 
-    settings = Settings(treatments=(), flow=None, **options.given_geometry(arguments))
-    console = Console()
+    console, settings = Console(), options.given_settings(arguments)
     with console.live():
         patches = export_patches(arguments.input, arguments.out, settings, console.progress)
     for patch in patches:

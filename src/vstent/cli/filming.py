@@ -1,10 +1,12 @@
 """Options on the films of an angiogram."""
 
 import argparse
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vstent.cli import options
+from vstent.fields import Option
 
 if TYPE_CHECKING:
     from vstent.angiography.filming import FilmSettings
@@ -18,31 +20,16 @@ def add_film(parser: argparse.ArgumentParser) -> None:
         metavar="ANGLES",
         help='C-arm direction, such as "LAO 30 CRA 10", AP or lateral (default: the neck in profile, proposed)',
     )
-    group.add_argument(
-        "--frame-rate", type=options.positive, default=7.5, metavar="HZ", help="frames per second (default: 7.5)"
-    )
+    positive = partial(Option, above=0.0)
+    options.add_option(group, positive("frame-rate", "frames per second", metavar="HZ", usual="7.5"), default=7.5)
     group.add_argument("--wires", action="store_true", help="show the wires of the device (default: subtracted)")
     group.add_argument("--vessel", action="store_true", help="show the vessel faintly (default: subtracted)")
-    group.add_argument(
-        "--pixel", type=options.positive, default=0.154, metavar="MM", help="detector pixel, mm (default: 0.154)"
-    )
-    group.add_argument(
-        "--source-detector",
-        type=options.positive,
-        default=1100.0,
-        metavar="MM",
-        help="distance from source to detector, mm (default: 1100)",
-    )
-    group.add_argument(
-        "--source-isocenter",
-        type=options.positive,
-        default=750.0,
-        metavar="MM",
-        help="distance from source to isocenter, mm; the vessel is there (default: 750)",
-    )
-    group.add_argument(
-        "--energy", type=options.positive, default=50.0, metavar="KEV", help="photon energy, keV (default: 50)"
-    )
+    options.add_option(group, positive("pixel", "detector pixel", unit="mm", usual="0.154"), default=0.154)
+    to_detector = positive("source-detector", "distance from source to detector", unit="mm", usual="1100")
+    options.add_option(group, to_detector, default=1100.0)
+    to_vessel = "distance from source to isocenter, where the vessel is"
+    options.add_option(group, positive("source-isocenter", to_vessel, unit="mm", usual="750"), default=750.0)
+    options.add_option(group, positive("energy", "photon energy", unit="keV", usual="50"), default=50.0)
     group.add_argument(
         "--dicom-like",
         type=Path,

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from vstent.cli.console import Console
-    from vstent.study.types import Settings
+    from vstent.study.settings import Settings
 
 
 def add(commands: options.Commands) -> None:
@@ -22,27 +22,23 @@ def add(commands: options.Commands) -> None:
         "Compute the blood flow in any vessel, with or without devices.",
         "flow artery.stl --grid-spacing 0.2 --out case",
     )
-    options.add_outlet(options.add_geometry(parser))
-    options.add_treatments(parser)
+    options.add_case(parser)
     parser.add_argument(
         "--convergence",
         action="store_true",
         help="compare the flow without a device on three grids, with three time steps and in three orientations",
     )
-    options.add_flow(parser)
+    options.add_settings(parser, *options.VESSEL, "treatments", "flow", without=("no-flow",))
     parser.set_defaults(command=_flow)
 
 
 def _flow(arguments: argparse.Namespace) -> int:
     """Run the command; return the exit code."""
     from vstent.cli.console import Console
-    from vstent.study.types import Settings
 
-    treatments = options.given_treatments(arguments, usual=())
-    if arguments.convergence and treatments:
+    settings = options.given_settings(arguments, device=())
+    if arguments.convergence and settings.treatments:
         raise InputError("--convergence compares flows without a device: leave out --device and --treatment.")
-    flow = options.given_flow(arguments)
-    settings = Settings(**options.given_geometry(arguments), treatments=treatments, flow=flow)
     console = Console()
     compute = _converge if arguments.convergence else _compute
     for table in compute(arguments.input, arguments.out, settings, console, arguments.replace):

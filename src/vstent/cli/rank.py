@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from vstent.cli import options
+from vstent.fields import Option, numbers, whole
 
 if TYPE_CHECKING:
     from vstent.cli.console import Console
     from vstent.geometry.vessel import Anatomy
     from vstent.plan.rank import Ranking
-    from vstent.study.types import Settings
+    from vstent.study.settings import Settings
 
 SHOWN: Final = 15
 """Number of rows shown on the terminal; the files hold all."""
@@ -24,31 +25,21 @@ def add(commands: options.Commands) -> None:
         "Deploy every size of the chosen devices, measure them and rank them.",
         "rank artery.stl --device silk --device pipeline --out case",
     )
-    options.add_outlet(options.add_geometry(parser))
-    options.add_devices(parser)
+    options.add_case(parser)
+    of_treatments = ("treatment", "diameter", "length", "center")
+    options.add_settings(parser, *options.VESSEL, "treatments", "flow", without=("no-flow", *of_treatments))
     ranking = parser.add_argument_group("ranking")
     ranking.add_argument("--criteria", type=Path, metavar="TOML", help="ranking criteria (default: vstent's own)")
-    ranking.add_argument(
-        "--shift",
-        type=options.numbers,
-        default=[0.0],
-        metavar="MM,MM,...",
-        help="shifts from the proposed landing to try, mm, positive distally (default: 0)",
-    )
-    ranking.add_argument(
-        "--flow",
-        dest="flow_count",
-        type=options.whole,
-        metavar="N",
-        help="compute the flow with the N best sizes, the best of each device among them (default: none)",
-    )
+    shift = "shifts from the proposed landing to try, mm, positive distally"
+    options.add_option(ranking, Option("shift", shift, numbers, metavar="MM,MM,...", usual="0"), default=(0.0,))
+    flows = "compute the flow with the N best sizes, the best of each device among them"
+    options.add_option(ranking, Option("flow", flows, whole, metavar="N", low=1, usual="none"), dest="flow_count")
     ranking.add_argument(
         "--retention",
         action="store_true",
         help="carry contrast through these flows too; the time that it stays in the sac counts in their scores",
     )
     options.add_crew(ranking)
-    options.add_flow(parser)
     parser.set_defaults(command=_rank)
 
 
@@ -62,33 +53,29 @@ def _rank(arguments: argparse.Namespace) -> int:
     from vstent.study.outputs import write_ranking
     from vstent.study.pipeline import restore_vessel
     from vstent.study.progress import Progress
-    from vstent.study.types import Settings
 
     if arguments.retention and not arguments.flow_count:
         raise InputError("Contrast moves with a flow. Give --flow N with --retention.")
     if (arguments.scheduler or arguments.slurm) and not arguments.flow_count:
         raise InputError("A cluster computes the flows of a ranking. Give --flow N with --scheduler or --slurm.")
-    devices = arguments.device or options.DEVICES
-    designs = {design.key: design for design in map(find_design, devices)}
-    if len(designs) < len(devices):
-        raise InputError("A device is given twice, and all its sizes are ranked at once: give each --device once.")
+    settings = options.given_settings(arguments)
+    designs = [find_design(name) for name in settings.devices]
     criteria = read_criteria(arguments.criteria) if arguments.criteria else default_criteria()
     console = Console()
-    settings = Settings(treatments=(), flow=None, **options.given_geometry(arguments))
     with console.live():
         anatomy, _ = restore_vessel(
             arguments.input, arguments.out, settings, console.progress, replaces=arguments.replace
         )
         ranking = rank(
             anatomy,
-            tuple(designs.values()),
+            designs,
             criteria=criteria,
             shifts_mm=arguments.shift,
             jobs=arguments.jobs,
             progress=lambda done, total: console.progress(Progress("rank", done / total, f"{done} of {total}")),
         )
         if arguments.flow_count:
-            ranking = _with_flows(arguments, anatomy, settings, ranking, console)
+            ranking = _with_flows(arguments, settings, anatomy, ranking, console)
     write_ranking(arguments.out, ranking)
     console.print(ranking_table(ranking, SHOWN))
     console.print(ranking_reasons(ranking, SHOWN))
@@ -97,9 +84,11 @@ def _rank(arguments: argparse.Namespace) -> int:
 
 
 def _with_flows(
-    arguments: argparse.Namespace, anatomy: "Anatomy", geometry: "Settings", ranking: "Ranking", console: "Console"
+    arguments: argparse.Namespace, settings: "Settings", anatomy: "Anatomy", ranking: "Ranking", console: "Console"
 ) -> "Ranking":
     """Return the ranking with the flows of its best sizes; an interrupted one goes on."""
+    from vstent.flow.settings import FlowSettings
+    from vstent.flow.simulation import check_engine
     from vstent.plan.rank_flow import chosen_of, rank_flows
     from vstent.study.flow_crew import compute_missing, parallel_flows
     from vstent.study.flow_store import FlowStore
@@ -109,22 +98,22 @@ def _with_flows(
     def told(done: int, total: int, name: str) -> None:
         console.progress(Progress("rank by flow", done / total, f"{done} of {total}: {name}"))
 
-    settings, has_contrast = options.given_flow(arguments), arguments.retention
-    key = anatomy_keys(hash_of(arguments.input), geometry)[ANATOMY]
-    stored, chosen = FlowStore(arguments.out, key, settings), chosen_of(ranking, arguments.flow_count)
-    jobs, memory_MB = parallel_flows(anatomy, chosen, settings, min(arguments.jobs, len(chosen)))
+    flow = settings.flow or FlowSettings()
+    check_engine(flow)
+    has_contrast = arguments.retention
+    key = anatomy_keys(hash_of(arguments.input), settings)[ANATOMY]
+    stored, chosen = FlowStore(arguments.out, key, flow), chosen_of(ranking, arguments.flow_count)
+    jobs, memory_MB = parallel_flows(anatomy, chosen, flow, min(arguments.jobs, len(chosen)))
     is_cluster = bool(arguments.scheduler or arguments.slurm)
     is_parallel = bool(anatomy.aneurysms and chosen) and (jobs > 1 or is_cluster)
     if is_parallel:
         crew = options.given_crew(arguments, jobs, memory_MB)
         threads = 1 if is_cluster else max(1, options.cores() // jobs)
-        compute_missing(
-            anatomy, chosen, settings, stored, crew, has_contrast=has_contrast, threads=threads, progress=told
-        )
+        compute_missing(anatomy, chosen, flow, stored, crew, has_contrast=has_contrast, threads=threads, progress=told)
     return rank_flows(
         anatomy,
         ranking,
-        settings,
+        flow,
         arguments.flow_count,
         has_contrast=has_contrast,
         stored=stored,

@@ -10,9 +10,8 @@ def add(commands: options.Commands) -> None:
     parser = options.add_command(
         commands, "restore", "Remove the sac, restore the parent artery, and measure both.", "restore scan/ --out case"
     )
-    given = options.add_geometry(parser)
-    options.add_outlet(given)
-    options.add_neck(given)
+    options.add_case(parser)
+    options.add_settings(parser, *options.VESSEL)
     parser.set_defaults(command=_restore)
 
 
@@ -20,10 +19,8 @@ def _restore(arguments: argparse.Namespace) -> int:
     """Run the command; return the exit code."""
     from vstent.cli.console import Console, morphology_table
     from vstent.study.pipeline import restore_vessel
-    from vstent.study.types import Settings
 
-    console = Console()
-    settings = Settings(treatments=(), flow=None, **options.given_geometry(arguments))
+    console, settings = Console(), options.given_settings(arguments)
     with console.live():
         _, measures = restore_vessel(
             arguments.input, arguments.out, settings, console.progress, replaces=arguments.replace

@@ -1,7 +1,7 @@
 """`vstent run`: from a scan or surface to the report."""
 
 import argparse
-from dataclasses import asdict, replace
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from vstent.angiography.angiogram import AngiogramSettings
     from vstent.cli.console import Console
     from vstent.study.progress import OnProgress
-    from vstent.study.types import CaseResult, Settings
+    from vstent.study.settings import Settings
+    from vstent.study.types import CaseResult
 
 
 def add(commands: options.Commands) -> None:
@@ -25,22 +26,8 @@ def add(commands: options.Commands) -> None:
         "Deploy stents in a patient's artery, compute the flow before and after, and write a report.",
         "run scan/ --device silk --device enterprise --out case",
     )
-    given = options.add_geometry(parser)
-    options.add_outlet(given)
-    options.add_neck(given)
-    given.add_argument(
-        "--diameter", type=options.positive, metavar="MM", help="label diameter of the devices, mm (default: proposed)"
-    )
-    given.add_argument(
-        "--length", type=options.positive, metavar="MM", help="label length of the devices, mm (default: proposed)"
-    )
-    given.add_argument(
-        "--center",
-        type=options.number,
-        metavar="MM",
-        help="position of the device's middle along the parent artery, mm (default: proposed)",
-    )
-    add_study(parser)
+    options.add_case(parser)
+    options.add_settings(parser, *options.VESSEL, *options.STUDY)
     parser.add_argument("--angiogram", action="store_true", help="also carry contrast through the flows and film it")
     add_injection(parser)
     add_pdf(parser)
@@ -54,35 +41,9 @@ def add(commands: options.Commands) -> None:
     parser.set_defaults(command=_run, answered=finished.answered)
 
 
-def add_study(parser: argparse.ArgumentParser) -> None:
-    """Add the options of a study: treatments, flow and uncertainty."""
-    options.add_treatments(parser)
-    flow = options.add_flow(parser)
-    flow.add_argument("--no-flow", action="store_true", help="deploy only, without computing the flow")
-    options.add_uncertainty(parser)
-
-
 def add_pdf(parser: argparse.ArgumentParser) -> None:
     """Add the option to write the report as PDF."""
     parser.add_argument("--pdf", action="store_true", help="also write the report as report.pdf")
-
-
-def given_study(arguments: argparse.Namespace) -> "Settings":
-    """Return the settings of a study.
-
-    Parameters
-    ----------
-    arguments : parsed options.
-    """
-    from vstent.study.types import Settings
-
-    flow = None if arguments.no_flow else options.given_flow(arguments)
-    return Settings(
-        **options.given_geometry(arguments),
-        treatments=options.given_treatments(arguments),
-        flow=flow,
-        uncertainty=options.given_ranges(arguments),
-    )
 
 
 def study(
@@ -157,14 +118,14 @@ def _run(arguments: argparse.Namespace) -> int:
     """Run the command; return the exit code."""
     from vstent.cli.console import Console
 
-    settings = given_study(arguments)
+    settings = options.given_settings(arguments)
     if arguments.plan:
         settings = replace(settings, flow=None)
     injected = given_angiogram(arguments) if arguments.angiogram else None
     if injected is not None and settings.flow is None:
         raise InputError("contrast moves with the flow: leave out --no-flow and --plan, or --angiogram.")
     if arguments.input.suffix == ".json":
-        return _again(arguments, settings, injected)
+        return _again(arguments, injected)
     given = {"is_printed": arguments.pdf, "replaces": arguments.replace, "injected": injected}
     console, before = Console(), finished.begun(arguments, arguments.input)
     case = study(arguments.input, arguments.out, settings, console, **given)
@@ -174,13 +135,12 @@ def _run(arguments: argparse.Namespace) -> int:
     return code
 
 
-def _again(arguments: argparse.Namespace, given: "Settings", injected: "AngiogramSettings | None") -> int:
+def _again(arguments: argparse.Namespace, injected: "AngiogramSettings | None") -> int:
     """Repeat a run from its ``run.json`` and compare the results; return the exit code."""
     from vstent.cli.console import Console
     from vstent.study.repeat import agreement, read_record
-    from vstent.study.types import Settings
 
-    if asdict(given) != asdict(Settings()):
+    if options.given(arguments):
         raise InputError(
             f"{arguments.input} states all settings: give only --out, --input, --pdf, --replace and --ro-crate with it."
         )

@@ -10,7 +10,8 @@ def add(commands: options.Commands) -> None:
     parser = options.add_command(
         commands, "trace", "Find the vessel wall, its openings and its centerlines.", "trace artery.stl --out case"
     )
-    options.add_geometry(parser)
+    options.add_case(parser)
+    options.add_settings(parser, *options.VESSEL, without=("outlet", "neck", "upstream", "downstream"))
     parser.set_defaults(command=_trace)
 
 
@@ -18,10 +19,8 @@ def _trace(arguments: argparse.Namespace) -> int:
     """Run the command; return the exit code."""
     from vstent.cli.console import Console, opening_table
     from vstent.study.pipeline import trace_vessel
-    from vstent.study.types import Settings
 
-    console = Console()
-    settings = Settings(treatments=(), flow=None, **options.given_geometry(arguments))
+    console, settings = Console(), options.given_settings(arguments)
     with console.live():
         vessel = trace_vessel(arguments.input, arguments.out, settings, console.progress, replaces=arguments.replace)
     console.print(opening_table(vessel.openings))

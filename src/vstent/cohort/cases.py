@@ -1,22 +1,19 @@
 """Read the cases of a cohort from a folder or a CSV file."""
 
 import csv
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 from vstent.devices.catalogue import find_design
-from vstent.devices.treatment import Treatment, with_device
 from vstent.errors import InputError, ReadError
+from vstent.fields import flag
+from vstent.flow.simulation import check_engine
 from vstent.io.files import IMAGE_SUFFIXES, SURFACE_SUFFIXES, suffix
-from vstent.io.tables import finite
 from vstent.study.keys import hash_of, measures_key, refuse_missing, study_keys
-from vstent.study.types import Settings
-from vstent.units import MM_PER
-
-Number = TypeVar("Number", int, float)
+from vstent.study.settings import OPTIONS, Settings, settings_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,17 +37,16 @@ class Case:
         return keys
 
 
-def find_cases(cohort: Path, settings: Settings) -> tuple[Case, ...]:
+def find_cases(cohort: Path, given: Mapping[str, Any]) -> tuple[Case, ...]:
     """Return the cases of a folder (every scan or surface in it) or of a CSV file.
 
     Parameters
     ----------
-    cohort : a folder, or a CSV file with column titles. Column ``input`` holds paths relative to the folder of the
-        file, ``case`` holds names (default: the file name), ``devices`` holds names separated by spaces. The other
-        columns are settings: ``units``, ``threshold``, ``at``, ``inlet`` (one point, or several separated by
-        semicolons), ``outlet``, ``spacing``, ``shape``, ``diameter``, ``length``, ``center``. An empty cell takes the
-        value of `settings`.
-    settings : settings for every case.
+    cohort : a folder, or a CSV file with column titles. Column ``input`` holds paths and ``case`` names (default: the
+        file name); every option of the settings may be a column of its name. Paths are relative to the folder of the
+        file. A flag is yes or no, and several values, such as devices or inlets, are separated by semicolons. An empty
+        cell takes the value of `given`.
+    given : values of options for every case, by name.
 
     Raises
     ------
@@ -60,7 +56,7 @@ def find_cases(cohort: Path, settings: Settings) -> tuple[Case, ...]:
         A row of the file cannot be used, or two cases have the same name.
     """
     refuse_missing(cohort)
-    cases = _in_folder(cohort, settings) if cohort.is_dir() else _in_file(cohort, settings)
+    cases = _in_folder(cohort, settings_of(given)) if cohort.is_dir() else _in_file(cohort, given)
     if not cases:
         raise ReadError(f"{cohort} holds no cases: give a folder of scans or surfaces, or a CSV file of their paths")
     names = [case.name for case in cases]
@@ -71,6 +67,8 @@ def find_cases(cohort: Path, settings: Settings) -> tuple[Case, ...]:
         )
     for device in {device for case in cases for device in case.settings.devices}:
         find_design(device)
+    for flow in {case.settings.flow for case in cases}:
+        check_engine(flow)
     return tuple(cases)
 
 
@@ -92,7 +90,7 @@ def _name(path: Path) -> str:
     return path.name if path.is_dir() else path.name[: len(path.name) - len(suffix(path))] or path.name
 
 
-def _in_file(path: Path, settings: Settings) -> list[Case]:
+def _in_file(path: Path, given: Mapping[str, Any]) -> list[Case]:
     """Return a case for every row of a CSV file."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
@@ -101,115 +99,46 @@ def _in_file(path: Path, settings: Settings) -> list[Case]:
         raise InputError(
             f"{path} cannot be read as a CSV file: {error}. Save it as UTF-8 with column titles."
         ) from error
-    return [_case(path, number, row, settings) for number, row in enumerate(rows, start=2)]
+    return [_case(path, number, row, given) for number, row in enumerate(rows, start=2)]
 
 
-def _case(file: Path, line: int, row: dict[str, Any], settings: Settings) -> Case:
+def _case(file: Path, line: int, row: Mapping[str, Any], given: Mapping[str, Any]) -> Case:
     """Return the case of one row of a CSV file; `line` is its line number for messages."""
-    given = {str(key).strip(): value.strip() for key, value in row.items() if isinstance(value, str) and value.strip()}
+    cells = {str(key).strip(): value.strip() for key, value in row.items() if isinstance(value, str) and value.strip()}
     where = f"line {line} of {file}"
-    unknown = sorted(set(given) - {"case", "input", *COLUMNS})
+    unknown = sorted(set(cells) - set(COLUMNS))
     if unknown:
-        raise InputError(
-            f"{where} has an unknown column {unknown[0]!r}: the columns are case, input, {', '.join(COLUMNS)}"
-        )
-    if "input" not in given:
+        raise InputError(f"{where} has an unknown column {unknown[0]!r}: the columns are {', '.join(COLUMNS)}")
+    if "input" not in cells:
         raise InputError(f"{where} has no input: fill in its column `input`")
-    path = file.parent / given["input"]
-    found: dict[str, dict[str, Any]] = {"input": {}, "anatomy": {}, "treatments": {}}
-    for title in set(given) & set(COLUMNS):
-        section, name, read = COLUMNS[title]
-        try:
-            found[section][name] = read(given[title])
-        except ValueError as error:
-            raise InputError(f"{where}: {title} is {given[title]!r}, which cannot be used: {error}") from error
-    name = given.get("case", _name(path))
+    path = file.parent / cells.pop("input")
+    name = cells.pop("case", _name(path))
     if Path(name).name != name:
         raise InputError(f"{where} names its case {name!r}: give a name without slashes")
     try:
-        changed = replace(
-            settings,
-            input=replace(settings.input, **found["input"]),
-            anatomy=replace(settings.anatomy, **found["anatomy"]),
-            treatments=_treatments(settings.treatments, **found["treatments"]),
-        )
+        return Case(name, path, settings_of({**given, **_read(cells, file.parent)}))
     except InputError as error:
-        raise InputError(f"{where}: {error}") from None
-    return Case(name, path, changed)
+        raise InputError(f"{where}: {error}") from error
 
 
-def _treatments(
-    usual: tuple[Treatment, ...], *, devices: Sequence[str] | None = None, **size: float
-) -> tuple[Treatment, ...]:
-    """Return the treatments with the devices of a row, or the usual ones, each with the size and place of the row."""
-    if devices is None and not size:
-        return usual
-    return tuple(with_device(name, **size) for name in devices or [name for one in usual for name in one.devices])
+def _read(cells: Mapping[str, str], folder: Path) -> dict[str, Any]:
+    """Return the values of options that the cells of a row state; `folder` is that of the file."""
+    found: dict[str, Any] = {}
+    for title, text in cells.items():
+        try:
+            if title in OPPOSITES:
+                found |= {OPPOSITES[title]: None} if flag(text) else {}
+            else:
+                found[title] = OPTIONS[title].cell(text, folder)
+        except InputError as error:
+            raise InputError(f"column {title}: {error}") from error
+    return found
 
 
-def _size(text: str) -> float:
-    """Return a finite number above zero read from text."""
-    return _above_zero(finite(text))
-
-
-def _count(text: str) -> int:
-    """Return a whole number above zero read from text."""
-    return _above_zero(int(text))
-
-
-def _above_zero(value: Number) -> Number:
-    """Return a value above zero; ValueError is raised for others."""
-    if value <= 0:
-        raise ValueError("it must be above zero")
-    return value
-
-
-def _units(text: str) -> str:
-    """Return a length unit read from text."""
-    if text not in MM_PER:
-        raise ValueError(f"give one of {', '.join(MM_PER)}")
-    return text
-
-
-def _words(text: str) -> list[str]:
-    """Return the words of a text separated by spaces, commas or semicolons."""
-    return text.replace(",", " ").replace(";", " ").split()
-
-
-def _three(kind: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
-    """Return a reader of three values of one kind."""
-
-    def read(text: str) -> tuple[Any, ...]:
-        values = tuple(kind(word) for word in _words(text))
-        if len(values) != 3:
-            raise ValueError("three numbers are needed")
-        return values
-
-    return read
-
-
-def _points(text: str) -> tuple[tuple[float, ...], ...]:
-    """Return points read from text, three numbers each."""
-    values = [finite(word) for word in _words(text)]
-    if len(values) % 3:
-        raise ValueError("three numbers are needed for every point")
-    return tuple(tuple(values[k : k + 3]) for k in range(0, len(values), 3))
-
-
-COLUMNS: Final[dict[str, tuple[str, str, Callable[[str], Any]]]] = {
-    "devices": ("treatments", "devices", _words),
-    "units": ("input", "units", _units),
-    "threshold": ("input", "threshold", finite),
-    "at": ("anatomy", "at_mm", _three(finite)),
-    "inlet": ("anatomy", "inlet_mm", _points),
-    "outlet": ("anatomy", "outlet_mm", _three(finite)),
-    "spacing": ("input", "spacing_mm", _three(_size)),
-    "shape": ("input", "shape", _three(_count)),
-    "diameter": ("treatments", "diameter_mm", _size),
-    "length": ("treatments", "length_mm", _size),
-    "center": ("treatments", "center_mm", finite),
-}
-"""Columns of a CSV file: the section of the settings and the setting that each sets, and the function that reads it."""
+OPPOSITES: Final = {option.off[0]: name for name, option in OPTIONS.items() if option.off[0]}
+"""Options that switch another one off, and that one."""
+COLUMNS: Final = ("case", "input", *OPTIONS, *OPPOSITES)
+"""Columns of a CSV file."""
 
 
 def row_count(cases: Sequence[Case]) -> int:

@@ -18,7 +18,7 @@ from vstent.reporting.figures import patient_picture
 from vstent.study.crews import alone
 from vstent.study.pipeline import restore_vessel, run
 from vstent.study.progress import OnProgress, Progress
-from vstent.study.types import Settings
+from vstent.study.settings import Settings
 from vstent.units import BYTES_PER_MB
 
 Row = dict[str, Any]

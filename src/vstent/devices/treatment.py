@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
 from vstent.errors import InputError
+from vstent.fields import LENGTH, POSITION, REQUIRED, setting
 
 Anchor = Literal["center", "distal", "proximal"]
 """Point of a device that is placed at the landing position."""
@@ -25,7 +26,9 @@ class Placing:
 
     path: str = "parent"
     """Name of the path in `Anatomy.paths`."""
-    position_mm: float | None = None
+    position_mm: float | None = setting(
+        None, "center", "position of the middle of every --device along the parent artery", usual="proposed", **POSITION
+    )
     """Position of the anchor along the path, in mm."""
     anchor: Anchor = "center"
     """Point of the implant that lies there."""
@@ -39,11 +42,21 @@ class Implant:
 
     id: str
     """Name within the treatment."""
-    device: str
+    device: str = setting(
+        REQUIRED,
+        "device",
+        "device of the catalogue, a treatment of its own",
+        str,
+        metavar="NAME",
+        usual="silk and enterprise",
+        separators=";, ",
+    )
     """Key of the design in the catalogue."""
-    diameter_mm: float | None = None
+    diameter_mm: float | None = setting(
+        None, "diameter", "label diameter of every --device", usual="proposed", **LENGTH
+    )
     """Label diameter in mm."""
-    length_mm: float | None = None
+    length_mm: float | None = setting(None, "length", "label length of every --device", usual="proposed", **LENGTH)
     """Label length in mm."""
     placing: Placing = Placing()
     """Where it is placed."""

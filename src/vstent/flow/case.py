@@ -8,7 +8,8 @@ import numpy as np
 
 from vstent.devices.stent import Stent
 from vstent.flow.ends import End, FlowRate, Inflow
-from vstent.flow.settings import Blood, Numerics, Waveform
+from vstent.flow.settings import Blood, Numerics
+from vstent.flow.waveform import Waveform
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Vessel
 from vstent.kernels import voxels

@@ -6,7 +6,7 @@ import numpy as np
 
 from vstent.errors import FlowError
 from vstent.flow.case import PHASES, FlowCase
-from vstent.flow.settings import Waveform
+from vstent.flow.waveform import Waveform
 from vstent.kernels.arrays import Floats
 
 STALLED: Final = 0.8

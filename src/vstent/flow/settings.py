@@ -3,12 +3,17 @@
 This module imports no numpy, so that command-line options and settings of a study can be read without it.
 """
 
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final, Literal
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Literal, get_args
+
+from vstent.fields import flag, setting, whole
+from vstent.flow.waveform import PUBLISHED, Waveform, read_waveform
 
 if TYPE_CHECKING:
     from vstent.kernels.arrays import Floats
 
+Outlets = Literal["zero_pressure", "murray"]
+"""Condition at the outlets."""
 LATTICE: Final = "lattice_boltzmann"
 """Name of the embedded lattice-Boltzmann engine."""
 OPENFOAM: Final = "openfoam"
@@ -46,11 +51,35 @@ class Blood:
     The defaults are those of Zhong et al. 2016, Sci. Rep. 6:21724.
     """
 
-    density_kg_m3: float = 1060.0
+    density_kg_m3: float = setting(
+        1060.0,
+        "density",
+        "density of blood",
+        unit="kg/m3",
+        low=900.0,
+        high=1200.0,
+        remark="1.06 g/mL are 1060 kg/m3",
+    )
     """Mass density."""
-    viscosity_Pa_s: float = 0.004
+    viscosity_Pa_s: float = setting(
+        0.004,
+        "viscosity",
+        "viscosity of blood",
+        unit="Pa s",
+        low=0.001,
+        high=0.1,
+        remark="4 mPa s are 0.004 Pa s",
+        usual=f"0.004; with --shear-thinning {HIGH_SHEAR_VISCOSITY_PA_S:g} at high shear",
+    )
     """Dynamic viscosity; with a shear-thinning law, its value at high shear rate."""
-    thinning: CarreauYasuda | None = None
+    thinning: CarreauYasuda | None = setting(
+        None,
+        "shear-thinning",
+        "shear-thinning blood after Carreau and Yasuda",
+        flag,
+        usual="Newtonian",
+        load=lambda is_thinning: CarreauYasuda() if is_thinning else None,
+    )
     """Shear-thinning law; None: Newtonian."""
 
     @property
@@ -70,42 +99,22 @@ class Blood:
 
 
 @dataclass(frozen=True)
-class Waveform:
-    """A periodic flow rate as a Fourier series, in multiples of its mean.
-
-    q(t) / mean = 1 + sum over k of a_k cos(k w t) + b_k sin(k w t), with w = 2 pi / period.
-    """
-
-    period_s: float
-    """Length of a cycle."""
-    cosine: tuple[float, ...]
-    """a_k for k = 1, 2, ..."""
-    sine: tuple[float, ...]
-    """b_k for k = 1, 2, ..."""
-
-    def factor(self, time_s: "Floats") -> "Floats":
-        """Return the flow rate divided by its mean (t,) at times (t,)."""
-        import numpy as np
-
-        angle = 2 * np.pi / self.period_s * np.multiply.outer(time_s, np.arange(1, len(self.cosine) + 1))
-        return 1 + np.cos(angle) @ np.array(self.cosine) + np.sin(angle) @ np.array(self.sine)
-
-    def curvature_per_s2(self, time_s: "Floats") -> "Floats":
-        """Return the second time derivative (t,) of `factor` at times (t,)."""
-        import numpy as np
-
-        rate_per_s = 2 * np.pi / self.period_s * np.arange(1, len(self.cosine) + 1)
-        harmonics = replace(self, cosine=tuple(rate_per_s**2 * self.cosine), sine=tuple(rate_per_s**2 * self.sine))
-        return 1 - harmonics.factor(time_s)
-
-
-@dataclass(frozen=True)
 class Numerics:
     """How a flow is computed; its physics is in the other `FlowSettings`."""
 
-    cell_size_mm: float | None = None
+    cell_size_mm: float | None = setting(
+        None,
+        "grid-spacing",
+        "spacing of the flow grid",
+        unit="mm",
+        usual="29 cells per diameter",
+        low=0.04,
+        high=1.0,
+    )
     """Grid spacing; None: `cells_per_diameter` cells across the vessel, but at most `cell_budget` cells in all."""
-    close_up: bool = False
+    close_up: bool = setting(
+        False, "refine-sac", "use the grid spacing only in and near the sac, and twice it elsewhere", flag
+    )
     """Whether to use this grid spacing only in and near the sac, and twice it elsewhere (see `lattice.close_up`)."""
     cells_per_diameter: float = 29.0
     """Number of cells across the mean (hydraulic) diameter 4 V / A of the vessel, where no grid spacing is given."""
@@ -127,11 +136,13 @@ class Numerics:
     """Peak speed in cells per time step. It sets the time step, which is a third longer in a steady refined sac
     (`close_up`). In steady flow it affects the result through the relaxation times, that is through the spatial
     error, not through the error in time."""
-    engine: str = LATTICE
+    engine: str = setting(
+        LATTICE, "engine", "flow engine: lattice_boltzmann, openfoam, or a plug-in", str, metavar="NAME"
+    )
     """Flow engine: ``lattice_boltzmann``, ``openfoam``, or the name of a plug-in (`vstent.plugins`)."""
-    processes: int = 1
+    processes: int = setting(1, "processes", "number of OpenFOAM processes", whole, short="-j", metavar="N", low=1)
     """Number of processes on this machine (OpenFOAM only)."""
-    device_gpu: bool = False
+    device_gpu: bool = setting(False, "gpu", "compute the flow on an NVIDIA GPU (needs the extra gpu)", flag)
     """Whether the embedded engine computes on a GPU (needs the extra ``gpu``); results differ in the last bits."""
 
 
@@ -139,13 +150,39 @@ class Numerics:
 class FlowSettings:
     """Settings of a flow computation."""
 
-    inflow_mL_s: float | None = None
+    inflow_mL_s: float | None = setting(
+        None,
+        "flow-rate",
+        "mean inflow of all inlets",
+        unit="mL/s",
+        usual="0.27 m/s times their area",
+        above=0.0,
+        high=50.0,
+        remark="240 mL/min are 4 mL/s",
+    )
     """Mean flow rate through all inlets together; None: 0.27 m/s times the area of each inlet."""
-    blood: Blood = field(default_factory=Blood)
+    blood: Blood = Blood()
     """The fluid."""
-    waveform: Waveform | None = None
+    waveform: Waveform | None = setting(
+        None,
+        "pulsatile",
+        "pulsatile inflow: a CSV file with columns time (s) and flow (any unit); without a file the published waveform "
+        "of the internal carotid artery (Hoi et al. 2010)",
+        str,
+        metavar="CSV",
+        alone=PUBLISHED,
+        load=read_waveform,
+        is_file=True,
+        off=("steady", "constant mean inflow (the default)"),
+    )
     """Inflow waveform; None: steady inflow at the mean."""
-    outlets: Literal["zero_pressure", "murray"] = "zero_pressure"
+    outlets: Outlets = setting(
+        "zero_pressure",
+        "outlets",
+        "zero pressure at the outlets, or flow split by Murray's law: by diameter cubed",
+        str,
+        choices=get_args(Outlets),
+    )
     """Zero pressure at every outlet, or outflow in proportion to radius cubed (Murray 1926, PNAS 12, 207)."""
-    numerics: Numerics = field(default_factory=Numerics)
+    numerics: Numerics = Numerics()
     """How it is computed."""

@@ -20,6 +20,7 @@ from vstent.flow.case import FlowCase, FlowField, Level, Phase, Target
 from vstent.flow.domain import MIN_CELLS, CoarseGridError, default_cell_size_mm
 from vstent.flow.engines import AbstractEngine, Bookmark, DivergenceError, Progress, Saved, run
 from vstent.flow.lattice.close_up import SHARE_AROUND, WIDTH, require_sac
+from vstent.flow.lattice.gpu import require_gpu
 from vstent.flow.problem import flow_case
 from vstent.flow.settings import LATTICE, OPENFOAM, FlowSettings, Numerics
 from vstent.geometry.vessel import Anatomy
@@ -174,6 +175,30 @@ def engine_class(numerics: Numerics, *, is_pulsatile: bool) -> type[AbstractEngi
             f"engine {LATTICE}"
         )
     return engine
+
+
+def check_engine(flow: FlowSettings | None) -> None:
+    """Check that the engine of a flow exists and supports its settings, and that there is a GPU where one is requested.
+
+    Parameters
+    ----------
+    flow : FlowSettings or None
+        Settings of the flow; None: no flow is computed.
+
+    Raises
+    ------
+    PluginError
+        There is no engine of this name.
+    InputError
+        The engine does not support the settings.
+    FlowError
+        There is no usable GPU.
+    """
+    if flow is None:
+        return
+    engine_class(flow.numerics, is_pulsatile=flow.waveform is not None)
+    if flow.numerics.device_gpu:
+        require_gpu()
 
 
 def _engine_of(case: FlowCase) -> type[AbstractEngine[Any]]:

@@ -1,11 +1,54 @@
-"""Inflow waveforms: the published one of the internal carotid artery, or a measured one."""
+"""Inflow waveforms: the published one of the internal carotid artery, or a measured one.
 
-import numpy as np
-from scipy.interpolate import CubicSpline
+Numpy is imported on use, so that the settings of a study can be read without it.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 from vstent.errors import InputError
-from vstent.flow.settings import Waveform
-from vstent.kernels.arrays import Floats
+
+if TYPE_CHECKING:
+    from vstent.kernels.arrays import Floats
+
+PUBLISHED: Final = "published"
+"""Word for the published waveform, in place of the file of a measured one."""
+LONGEST_CYCLE_S: Final = 3.0
+"""Longest cardiac cycle accepted, in s: 20 beats a minute."""
+SHORTEST_CYCLE_S: Final = 0.2
+"""Shortest cardiac cycle accepted, in s: 300 beats a minute."""
+
+
+@dataclass(frozen=True)
+class Waveform:
+    """A periodic flow rate as a Fourier series, in multiples of its mean.
+
+    q(t) / mean = 1 + sum over k of a_k cos(k w t) + b_k sin(k w t), with w = 2 pi / period.
+    """
+
+    period_s: float
+    """Length of a cycle."""
+    cosine: tuple[float, ...]
+    """a_k for k = 1, 2, ..."""
+    sine: tuple[float, ...]
+    """b_k for k = 1, 2, ..."""
+
+    def factor(self, time_s: "Floats") -> "Floats":
+        """Return the flow rate divided by its mean (t,) at times (t,)."""
+        import numpy as np
+
+        angle = 2 * np.pi / self.period_s * np.multiply.outer(time_s, np.arange(1, len(self.cosine) + 1))
+        return 1 + np.cos(angle) @ np.array(self.cosine) + np.sin(angle) @ np.array(self.sine)
+
+    def curvature_per_s2(self, time_s: "Floats") -> "Floats":
+        """Return the second time derivative (t,) of `factor` at times (t,)."""
+        import numpy as np
+
+        rate_per_s = 2 * np.pi / self.period_s * np.arange(1, len(self.cosine) + 1)
+        harmonics = replace(self, cosine=tuple(rate_per_s**2 * self.cosine), sine=tuple(rate_per_s**2 * self.sine))
+        return 1 - harmonics.factor(time_s)
+
 
 OLDER_ADULT_ICA = Waveform(
     period_s=0.951,
@@ -61,7 +104,33 @@ RESAMPLED = 512
 """Number of equally spaced times at which the spline of a measured waveform is sampled."""
 
 
-def waveform_of(time_s: Floats, flow: Floats) -> Waveform:
+def read_waveform(source: str) -> Waveform:
+    """Return the published waveform, or the one in a CSV file.
+
+    Parameters
+    ----------
+    source : ``published``, or the path of a file with the times (s) and flow rates of one cycle in two columns.
+
+    Raises
+    ------
+    InputError
+        The file holds no cardiac cycle.
+    """
+    from vstent.io.tables import read_columns
+
+    if source == PUBLISHED:
+        return OLDER_ADULT_ICA
+    time_s, flow = read_columns(Path(source), 2).T
+    waveform = waveform_of(time_s, flow)
+    if not SHORTEST_CYCLE_S <= waveform.period_s <= LONGEST_CYCLE_S:
+        raise InputError(
+            f"the cycle in {source} lasts {waveform.period_s:g} s, a cardiac cycle {SHORTEST_CYCLE_S:g} to "
+            f"{LONGEST_CYCLE_S:g} s: give one cycle with times in seconds"
+        )
+    return waveform
+
+
+def waveform_of(time_s: "Floats", flow: "Floats") -> Waveform:
     """Fit a waveform to a measured cycle.
 
     Parameters
@@ -76,6 +145,9 @@ def waveform_of(time_s: Floats, flow: Floats) -> Waveform:
     InputError
         There are fewer than 5 samples, the times do not increase, or the mean flow is not positive.
     """
+    import numpy as np
+    from scipy.interpolate import CubicSpline
+
     time_s, flow = np.asarray(time_s, dtype=np.float64), np.array(flow, dtype=np.float64)
     if len(time_s) < 5 or len(time_s) != len(flow):
         raise InputError(

@@ -7,7 +7,6 @@ of a Sobol sequence, each in the middle of its stratum. Every cause alone is thu
 the same study gives the same result.
 """
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,8 +16,8 @@ import numpy as np
 
 from vstent.deployment.deploy import deploy
 from vstent.deployment.measure import measure
-from vstent.devices.design import Design, Range, Size
-from vstent.devices.ranges import altered, uncertain, values_at
+from vstent.devices.design import Design, Size
+from vstent.devices.ranges import altered, values_at
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import DeviceError, InputError, LandingError
 from vstent.flow.indices import indices, ratios
@@ -29,6 +28,7 @@ from vstent.flow.simulation import Checkpoint, simulate_case
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Floats, freeze
 from vstent.kernels.sobol import centered_points
+from vstent.plan.ranges import Ranges
 from vstent.plan.shares import first_order_shares
 from vstent.plan.widening import widened
 
@@ -49,63 +49,6 @@ WIDEST_FRACTION: Final = 0.1
 """Fraction of the free diameter below which the range of the device's diameter must be."""
 INTERVAL: Final = (0.025, 0.975)
 """Quantiles at the ends of an interval: 95 % of the samples lie in it."""
-
-
-@dataclass(frozen=True)
-class Ranges:
-    """Range of each cause and number of samples. The default ranges are vstent's own."""
-
-    samples: int = 32
-    """Number of deployments, rounded up to a power of two."""
-    flow_samples: int = 0
-    """Number of deployments whose flow is computed without and with the device; each takes as long as a study."""
-    threshold_mm: float | None = None
-    """Range of all diameters, in mm; None uses `threshold_band_mm` of the vessel, 0 for a surface."""
-    landing_mm: float = 1.0
-    """Range of the landing position along the axis, in mm."""
-    device_mm: float = 0.1
-    """Range of the free diameter as made, in mm; the number of pieces of wire stays the same."""
-    inflow_fraction: float = 0.2
-    """Range of the mean inflow, relative."""
-    numbers_factor: float = 1.0
-    """Factor, 0 to 1, of the ranges of the device's numbers in the catalogue; 0 leaves them out."""
-
-    def __post_init__(self) -> None:
-        if self.samples < 2 or self.flow_samples < 0:
-            raise InputError(
-                f"{self.samples} samples, {self.flow_samples} of them with flows, are too few for a spread: "
-                "give at least 2 samples, and 0 or more flows"
-            )
-        for name in ("threshold_mm", "landing_mm", "device_mm", "inflow_fraction", "numbers_factor"):
-            value = getattr(self, name)
-            if value is not None and not 0 <= value < math.inf:
-                raise InputError(f"{value:g} is not a range of {name}: give 0 or more, to either side")
-        if self.numbers_factor > 1:
-            raise InputError(
-                f"ranges of the device's numbers cannot be {self.numbers_factor:g} times as wide: give 0 to 1"
-            )
-        if self.inflow_fraction >= 1:
-            raise InputError(
-                f"an inflow that varies by a fraction of {self.inflow_fraction:g} could vanish: give less than 1"
-            )
-
-    def of(self, anatomy: Anatomy) -> Floats:
-        """Return the ranges (4,) in the order of `CAUSES`."""
-        band_mm = anatomy.vessel.threshold_band_mm if self.threshold_mm is None else self.threshold_mm
-        return np.array([band_mm, self.landing_mm, self.device_mm, self.inflow_fraction])
-
-    def numbers_of(self, design: Design) -> tuple[Range, ...]:
-        """Return the ranges of the numbers of a device that are varied."""
-        if not self.numbers_factor:
-            return ()
-        return tuple(_narrowed(one, self.numbers_factor) for one in uncertain(design))
-
-
-def _narrowed(one: Range, factor: float) -> Range:
-    """Return a range whose ends are nearer to the value by a factor."""
-    return replace(
-        one, low=one.value + factor * (one.low - one.value), high=one.value + factor * (one.high - one.value)
-    )
 
 
 @dataclass(frozen=True, eq=False)

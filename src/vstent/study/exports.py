@@ -1,7 +1,7 @@
 """Export a case or an input for other solvers: an OpenFOAM case folder, or named patches."""
 
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +24,9 @@ from vstent.study.folder import CACHE, RUN
 from vstent.study.keys import anatomy_keys, hash_of
 from vstent.study.progress import OnProgress
 from vstent.study.repeat import finished_run
+from vstent.study.settings import AnatomySettings, InputSettings, Settings, differing
 from vstent.study.stages import check_inflow, deploy_implant, find_anatomy
 from vstent.study.store import Store
-from vstent.study.types import Settings
 
 
 def export_openfoam(
@@ -58,7 +58,7 @@ def export_openfoam(
     anatomy = _anatomy(path, settings, store)
     check_inflow(anatomy, settings.flow)
     case = flow_case(anatomy, _implants(path, anatomy, settings, store), settings.flow)
-    setup = FoamSetup(default_cell_size_mm(case))
+    setup = FoamSetup(default_cell_size_mm(case), processes=case.numerics.processes)
     setup = replace(setup, **{"flavour": _flavour_here(), **foam}, struts=strut_solids(case))
     with store.stage("export") as tell:
         written = foam_case(case, setup)
@@ -117,14 +117,9 @@ def _anatomy(path: Path, settings: Settings, store: Store) -> Anatomy:
     kept = sorted((path / CACHE).glob("anatomy-*.npz")) if path.is_dir() else []
     if not kept:
         return find_anatomy(path, settings, store, anatomy_keys(hash_of(path), settings))
-    given = [
-        field.name
-        for part in (settings.input, settings.anatomy)
-        for field in fields(part)
-        if getattr(part, field.name) is not None
-    ]
+    given = [*differing(InputSettings(), settings.input), *differing(AnatomySettings(), settings.anatomy)]
     if given:
-        words = ", ".join(f"--{name.removesuffix('_mm')}" for name in given)
+        words = ", ".join(f"--{name}" for name in given)
         raise InputError(f"{path} is a case folder, whose vessel is exported as it is: leave out {words}")
     with store.stage("anatomy") as tell:
         anatomy = load_data(kept[-1], Anatomy)

@@ -15,8 +15,8 @@ from vstent.errors import InputError
 from vstent.io.writers import write_json
 from vstent.study.folder import CACHE, RUN
 from vstent.study.repeat import former_source, settings_of
+from vstent.study.settings import Settings, differing
 from vstent.study.store import UNREADABLE
-from vstent.study.types import Settings
 
 BEGUN: Final = "settings.json"
 """File in the cache folder with the settings of the last run that was started, finished or not."""
@@ -100,18 +100,11 @@ def refuse_other_anatomy(out: Path, settings: Settings, former: Settings | None 
     former = former or former_settings(out)
     if former is None:
         return
-    before, now = (asdict(one.input) | asdict(one.anatomy) for one in (former, settings))
-    changed = [key for key in now if now[key] != before[key]]
+    changed = [*differing(former.input, settings.input), *differing(former.anatomy, settings.anatomy)]
     if changed:
         raise InputError(
-            f"{out} holds results with another {', '.join(map(_named, changed))}. Give another --out, or --replace to "
-            "replace them."
+            f"{out} holds results with another {', '.join(changed)}. Give another --out, or --replace to replace them."
         )
-
-
-def _named(key: str) -> str:
-    """Return the name of a setting without its unit."""
-    return key.removesuffix("_mm").replace("_", " ")
 
 
 def _same(out: Path, what: str, former: Any, given: Any) -> Any:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from vstent.angiography.angiogram import AngiogramSettings
     from vstent.devices.design import Design
     from vstent.flow.settings import FlowSettings
-    from vstent.study.types import Settings
+    from vstent.study.settings import Settings
 
 ANATOMY: Final = "anatomy"
 """Name of the anatomy in the store."""

@@ -14,6 +14,7 @@ from typing import Any
 from vstent.anatomy.morphology import morphology
 from vstent.devices.stent import Deployment
 from vstent.flow.convergence import Sensitivity
+from vstent.flow.simulation import check_engine
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io import writers
 from vstent.study.contrast import add_measures, kept_measures
@@ -33,6 +34,7 @@ from vstent.study.outputs import (
 from vstent.study.progress import OnProgress, Progress
 from vstent.study.provenance import METRICS, provenance
 from vstent.study.repeat import SECONDS, former_source, is_of_another
+from vstent.study.settings import Settings
 from vstent.study.stages import (
     check_inflow,
     compute_flows,
@@ -45,7 +47,7 @@ from vstent.study.stages import (
     vary_all,
 )
 from vstent.study.store import Store
-from vstent.study.types import CaseResult, Computed, Settings
+from vstent.study.types import CaseResult, Computed
 
 Implants = Mapping[str, Mapping[str, Deployment]]
 """Deployed implants by treatment and id."""
@@ -88,6 +90,7 @@ def run(
     FolderError
         Another process uses the folder, or it cannot be written.
     """
+    check_engine(settings.flow)
     store = Store(out / CACHE, progress)
     source = hash_of(path)
     if not replaces:
@@ -231,6 +234,7 @@ def refine_flow(
     FolderError
         Another process uses the folder, or it cannot be written.
     """
+    check_engine(settings.flow)
     store = Store(out / CACHE, progress)
     source = hash_of(path)
     _refuse_loss(out, source, settings, replaces)

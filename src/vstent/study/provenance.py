@@ -10,8 +10,8 @@ from typing import Any, Final
 from vstent.devices.catalogue import find_design
 from vstent.flow.lattice.gpu import gpu_name
 from vstent.study.folder import LAYOUT
+from vstent.study.settings import Settings
 from vstent.study.store import digest
-from vstent.study.types import Settings
 
 PACKAGES: Final = ("vstent", "numpy", "scipy", "numba", "vtk", "SimpleITK", "pydicom")
 """Packages whose versions are recorded."""

@@ -13,8 +13,8 @@ from vstent.io.files import existing
 from vstent.study.folder import CACHE, INPUT, LAYOUT, RUN
 from vstent.study.keys import hash_of
 from vstent.study.provenance import METRICS, devices_of, machine, versions
+from vstent.study.settings import Settings
 from vstent.study.store import UNREADABLE
-from vstent.study.types import Settings
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter

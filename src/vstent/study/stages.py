@@ -42,8 +42,8 @@ from vstent.plan.uncertainty import Uncertainty, vary
 from vstent.study.folder import flow_folder
 from vstent.study.keys import ANATOMY, VESSEL, stage_name
 from vstent.study.outputs import write_field
+from vstent.study.settings import Point, Settings
 from vstent.study.store import Key, Store, Unfinished
-from vstent.study.types import Point, Settings
 from vstent.units import counted
 
 SLOWEST_M_S: Final = 0.01

@@ -36,7 +36,7 @@ from vstent.flow.simulation import engine_class, foretell_cost, simulate_case
 from vstent.kernels.directions import VELOCITIES
 from vstent.study import repeat
 from vstent.study.provenance import machine, provenance
-from vstent.study.types import Settings
+from vstent.study.settings import Settings
 
 CELL_MM, RADIUS_MM, LENGTH_MM = 0.4, 0.8, 2.4
 SETTLED_PAIRS = 3 * lattice_state.DEFER_PAIRS

@@ -14,7 +14,7 @@ from vstent.flow.cycles import pulse_of
 from vstent.flow.domain import extended_volume_mm3
 from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.kernels import d3q19
-from vstent.flow.settings import Waveform
+from vstent.flow.waveform import Waveform
 from vstent.kernels.arrays import Floats, Ints
 from vstent.units import M_PER_MM
 

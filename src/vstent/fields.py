@@ -1,0 +1,208 @@
+"""Fields of the settings: each states its option, unit and limits, from which command line, tables and page are made.
+
+This module imports no numpy, so that the help of the command line appears at once.
+"""
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from pathlib import Path
+from typing import Any, Final, get_args
+
+from vstent.errors import InputError
+
+WORDS: Final = {"yes": True, "true": True, "1": True, "no": False, "false": False, "0": False}
+"""Values of a flag in a table."""
+REQUIRED: Final[Any] = MISSING
+"""Default of a field that must be given."""
+LENGTH: Final[dict[str, Any]] = {"unit": "mm", "above": 0.0, "high": 1000.0}
+"""Unit and limits of a length."""
+POSITION: Final[dict[str, Any]] = {"unit": "mm", "low": -1e4, "high": 1e4}
+"""Unit and limits of a coordinate, or of a position along an artery."""
+
+
+def number(text: str) -> float:
+    """Return a number read from text."""
+    return _numbers(text, float, 1)[0]
+
+
+def whole(text: str) -> int:
+    """Return a whole number read from text."""
+    return _numbers(text, int, 1)[0]
+
+
+def numbers(text: str) -> tuple[float, ...]:
+    """Return numbers read from text."""
+    return _numbers(text, float, len(_parts(text)))
+
+
+def point(text: str) -> tuple[float, ...]:
+    """Return three numbers read from text."""
+    return _numbers(text, float, 3)
+
+
+def box(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return two points read from text."""
+    found = _numbers(text, float, 6)
+    return found[:3], found[3:]
+
+
+def shape(text: str) -> tuple[int, ...]:
+    """Return three whole numbers read from text."""
+    return _numbers(text, int, 3)
+
+
+def spacing(text: str) -> tuple[float, ...]:
+    """Return three numbers read from text; one number stands for all three."""
+    return _numbers(text, float, 3) if len(_parts(text)) > 1 else 3 * _numbers(text, float, 1)
+
+
+def flag(text: str) -> bool:
+    """Return whether a text says yes."""
+    if text.lower() not in WORDS:
+        raise InputError(f"{text!r} is not yes or no")
+    return WORDS[text.lower()]
+
+
+def _parts(text: str) -> list[str]:
+    """Return the parts of a text that are separated by commas, semicolons, spaces or x."""
+    return re.split(r"\s*[,;x]\s*|\s+", text.strip())
+
+
+def _numbers(text: str, kind: type, count: int) -> tuple[Any, ...]:
+    """Return `count` finite numbers read from text."""
+    try:
+        found = tuple(kind(part) for part in _parts(text))
+    except ValueError:
+        found = ()
+    if len(found) != count or not all(map(math.isfinite, found)):
+        what = {(1, float): "a number", (1, int): "a whole number"}.get((count, kind), f"{count} numbers such as 1,2,3")
+        raise InputError(f"{text!r} is not {what}")
+    return found
+
+
+@dataclass(frozen=True)
+class Option:
+    """How a setting is stated as text, and which values it may have."""
+
+    name: str
+    """Name of the option on the command line, without dashes, and of the column in a table."""
+    help: str
+    """What it is, for the help of the command line."""
+    read: Callable[[str], Any] = number
+    """Reads a value from text."""
+    unit: str = ""
+    """Unit of the value."""
+    metavar: str = ""
+    """Placeholder of the value in the help; empty: the unit."""
+    usual: str = ""
+    """What is taken where it is not given."""
+    low: float = -math.inf
+    """Lowest value."""
+    high: float = math.inf
+    """Highest value."""
+    above: float = -math.inf
+    """Number that every value exceeds."""
+    remark: str = ""
+    """A conversion into the unit, such as 240 mL/min are 4 mL/s."""
+    choices: tuple[str, ...] = ()
+    """All values of a word; empty: any."""
+    separators: str = ""
+    """Characters between several values in a cell of a table; empty: the option is given once."""
+    short: str = ""
+    """Short name of the option with its dash."""
+    off: tuple[str, str] = ("", "")
+    """Name and help of the option that states the opposite."""
+    alone: str | None = None
+    """Value of an option that is given without one."""
+    load: Callable[[Any], Any] | None = None
+    """Returns the setting that a value stands for, such as the content of a file; None: the value itself."""
+    is_file: bool = False
+    """Whether the value is the path of a file, unless it is `alone`."""
+    is_place: bool = False
+    """Whether the setting is a point, or several, in the frame of the input."""
+
+    @property
+    def limits(self) -> str:
+        """The permitted values as text, with their unit."""
+        is_open = self.above > self.low
+        said = f"above {self.above:g}" if is_open else f"{self.low:g}"
+        if math.isinf(self.high):
+            said = said if is_open else f"at least {said}"
+        else:
+            said += f"{', up' if is_open else ''} to {self.high:g}"
+        return f"{said} {self.unit}".rstrip() + (f" ({self.remark})" if self.remark else "")
+
+    def value(self, text: str) -> Any:
+        """Return a value read from the command line.
+
+        Raises
+        ------
+        InputError
+            The text is no value of this option.
+        """
+        if self.choices and text not in self.choices:
+            raise InputError(f"{text!r} is not one of {', '.join(self.choices)}")
+        found = self.read(text)
+        self.check(found)
+        return found
+
+    def cell(self, text: str, folder: Path) -> Any:
+        """Return a value, or several, read from a cell of a table.
+
+        Parameters
+        ----------
+        text : content of the cell.
+        folder : folder of the table, to which paths are relative.
+
+        Raises
+        ------
+        InputError
+            The text is no value of this option.
+        """
+        if self.separators:
+            return tuple(self.value(part.strip()) for part in re.split(f"[{self.separators}]", text) if part.strip())
+        return self.value(str(folder / text) if self.is_file and text != self.alone else text)
+
+    def check(self, value: Any) -> None:
+        """Raise InputError where a number, or one of several, is outside the limits."""
+        for one in value if isinstance(value, tuple | list) else [value]:
+            if isinstance(one, tuple | list):
+                self.check(one)
+            elif isinstance(one, int | float) and not (
+                self.low <= one <= self.high and self.above < one and math.isfinite(one)
+            ):
+                raise InputError(f"{one:g} {self.unit}".rstrip() + f" is out of range: give {self.limits}")
+
+
+def setting(default: Any, name: str, text: str, read: Callable[[str], Any] = number, **more: Any) -> Any:
+    """Return a field of a data class with an option.
+
+    Parameters
+    ----------
+    default : default of the field, immutable.
+    name : name of the option.
+    text : what it is, for the help.
+    read : reads a value from text.
+    more : further fields of `Option`.
+    """
+    is_number = isinstance(default, int | float) and not isinstance(default, bool)
+    usual = more.pop("usual", f"{default:g}" if is_number else default if isinstance(default, str) else "")
+    return field(default=default, metadata={"option": Option(name, text, read, usual=usual, **more)})
+
+
+def stated(kind: type) -> dict[str, Option]:
+    """Return the options of a data class and of those in it, by the dotted path of their fields."""
+    found = {}
+    for one in fields(kind):
+        if "option" in one.metadata:
+            found[one.name] = one.metadata["option"]
+        for section in sections_of(one.type):
+            found |= {f"{one.name}.{path}": option for path, option in stated(section).items()}
+    return found
+
+
+def sections_of(kind: Any) -> list[Any]:
+    """Return the data classes that a type, an optional type or a tuple consists of."""
+    return [one for one in (kind, *get_args(kind)) if is_dataclass(one)]
