@@ -69,7 +69,7 @@ os.replace = replacing
 from vstent.flow.settings import FlowSettings, Numerics
 engines.SAVE_EVERY_S = 0.0
 flow = FlowSettings(inflow_mL_s=2.0, numerics=Numerics(cell_size_mm=0.45, max_steps=400))
-settings = Settings(devices=("silk",), units="mm", flow=flow)
+settings = Settings(treatments=(with_device("silk"),), input=InputSettings(units="mm"), flow=flow)
 run(pathlib.Path(path), pathlib.Path(out), settings, lambda stage, fraction, detail: die(f"{stage} {fraction:.0f}"))
 """
 """A study that kills itself, without a chance to tidy up, at a moment given: a stage's begin (0) or end (1)."""

@@ -331,8 +331,8 @@ def test_a_study_keeps_its_inlets_from_the_command_line_to_the_numbers_and_back(
     openings = json.loads((study / "openings.json").read_text())["openings"]
     assert [opening["role"] for opening in openings] == ["inlet", "inlet_2", "outlet_1"]
     for flow in (
-        (metrics := json.loads((study / "metrics.json").read_text()))["bare"],
-        metrics["stents"]["silk"]["flow"],
+        (metrics := json.loads((study / "metrics.json").read_text()))["treatments"]["bare"]["flow"],
+        metrics["treatments"]["silk"]["flow"],
     ):
         entering = flow["inlet_flow_mL_s"] + flow["inlet_2_flow_mL_s"]
         assert flow["outlet_1_flow_mL_s"] == pytest.approx(entering, rel=1e-3)

@@ -18,16 +18,16 @@ from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_stl
 from vstent.plan.ranges import Ranges
 from vstent.plan.rank import rank
-from vstent.study import stages
 from vstent.study import keys as study_keying
+from vstent.study import stages
 from vstent.study.keys import implant_keys, study_keys
 from vstent.study.outputs import write_ranking
 from vstent.study.pipeline import refine_flow, restore_vessel, run, trace_vessel
-from vstent.study.store import Key
 from vstent.study.settings import AnatomySettings, InputSettings, Settings
+from vstent.study.store import Key
 
 FLOW = FlowSettings(inflow_mL_s=2.0, numerics=Numerics(cell_size_mm=0.5, max_steps=20))
-PLAIN = Settings(devices=("silk",), units="mm", flow=None)
+PLAIN = Settings(treatments=(with_device("silk"),), input=InputSettings(units="mm"), flow=None)
 
 
 @pytest.fixture(scope="module")
@@ -59,24 +59,24 @@ def quiet(*_: object) -> None:
 
 def held(folder: Path) -> dict[str, bytes]:
     """Return the files of devices and flows of a case folder, and what was found of other kinds."""
-    names = ("stents/**/*", "flow/**/*", "morphology.json", "ranking.csv", "convergence.json", "report.html")
+    names = ("treatments/**/*", "convergence/**/*", "morphology.json", "ranking.csv", "convergence.json", "report.html")
     files = [path for name in names for path in folder.glob(name) if path.is_file()]
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
 EXISTING = {
     "a device": PLAIN,
-    "two devices": replace(PLAIN, devices=("silk", "enterprise")),
+    "two devices": replace(PLAIN, treatments=(with_device("silk"), with_device("enterprise"))),
     "a device and its flow": replace(PLAIN, flow=FLOW),
-    "a size": replace(PLAIN, placings={"silk": Placing(4.0, 20.0)}),
+    "a size": replace(PLAIN, treatments=(with_device("silk", diameter_mm=4.0, length_mm=20.0),)),
     "a spread": replace(PLAIN, uncertainty=Ranges(samples=2)),
 }
 COMMANDS = {
-    "another device": replace(PLAIN, devices=("pipeline",)),
-    "another device and its flow": replace(PLAIN, devices=("enterprise",), flow=FLOW),
+    "another device": replace(PLAIN, treatments=(with_device("pipeline"),)),
+    "another device and its flow": replace(PLAIN, treatments=(with_device("enterprise"),), flow=FLOW),
     "the same device": PLAIN,
     "the same device and its flow": replace(PLAIN, flow=FLOW),
-    "the same and another": replace(PLAIN, devices=("silk", "leo")),
+    "the same and another": replace(PLAIN, treatments=(with_device("silk"), with_device("leo"))),
     "another size": replace(PLAIN, diameter_mm=4.0, length_mm=15.0),
     "another flow": replace(PLAIN, flow=replace(FLOW, inflow_mL_s=3.0)),
     "less artery": replace(PLAIN, upstream_mm=12.0),
@@ -105,9 +105,10 @@ def test_after_any_command_all_that_a_folder_held_is_there_or_the_command_is_ref
     after = held(out)
     assert {name: after.get(name) for name in before} == before
     told = json.loads((out / "metrics.json").read_text())
-    for name, of_device in metrics["stents"].items():
-        assert of_device.items() <= told["stents"][name].items()
-    assert set(told["stents"]) == set(metrics["stents"]) | set(COMMANDS[command].devices)
+    for name, found in metrics["treatments"].items():
+        assert found.items() <= told["treatments"][name].items()
+    asked = {treatment.name for treatment in COMMANDS[command].treatments}
+    assert set(told["treatments"]) - {"bare"} == (set(metrics["treatments"]) | asked) - {"bare"}
 
 
 @pytest.mark.parametrize("command", [run, restore_vessel, trace_vessel, refine_flow])
@@ -125,8 +126,10 @@ def test_another_input_is_refused_unless_it_is_to_replace(
 def test_added_devices_are_what_they_are_in_a_folder_of_their_own(arteries: tuple[Path, Path], tmp_path: Path) -> None:
     out, anew = tmp_path / "out", tmp_path / "anew"
     run(arteries[0], out, replace(PLAIN, flow=FLOW), quiet)
-    run(arteries[0], out, replace(PLAIN, devices=("enterprise",), flow=FLOW), quiet)
-    run(arteries[0], anew, replace(PLAIN, devices=("silk", "enterprise"), flow=FLOW), quiet)
+    run(arteries[0], out, replace(PLAIN, treatments=(with_device("enterprise"),), flow=FLOW), quiet)
+    run(
+        arteries[0], anew, replace(PLAIN, treatments=(with_device("silk"), with_device("enterprise")), flow=FLOW), quiet
+    )
     assert (out / "metrics.json").read_bytes() == (anew / "metrics.json").read_bytes()
 
 
@@ -135,12 +138,12 @@ def test_a_device_added_without_flow_gets_none_and_the_flows_stay(
 ) -> None:
     out = tmp_path / "out"
     run(arteries[0], out, replace(PLAIN, flow=FLOW), quiet)
-    case = run(arteries[0], out, replace(PLAIN, devices=("pipeline",)), quiet)
+    case = run(arteries[0], out, replace(PLAIN, treatments=(with_device("pipeline"),)), quiet)
     assert bare_flow_for_all == ["bare", "device"]
     assert set(case.fields) == {"bare", "silk"}
-    assert set(case.deployments) == {"silk", "pipeline"}
-    assert "flow" not in case.metrics["stents"]["pipeline"]
-    later = run(arteries[0], out, replace(PLAIN, devices=("pipeline",), flow=FLOW), quiet)
+    assert set(case.implants) == {"silk", "pipeline"}
+    assert "flow" not in case.metrics["treatments"]["pipeline"]
+    later = run(arteries[0], out, replace(PLAIN, treatments=(with_device("pipeline"),), flow=FLOW), quiet)
     assert bare_flow_for_all == ["bare", "device", "device"]
     assert set(later.fields) == {"bare", "silk", "pipeline"}
 
@@ -148,7 +151,7 @@ def test_a_device_added_without_flow_gets_none_and_the_flows_stay(
 def test_a_device_that_does_not_fit_is_a_row_with_its_reason(
     arteries: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = replace(PLAIN, devices=("silk", "enterprise"))
+    settings = replace(PLAIN, treatments=(with_device("silk"), with_device("enterprise")))
     real = stages.deploy_one
 
     def too_long(design: object, *given: object) -> object:
@@ -158,7 +161,7 @@ def test_a_device_that_does_not_fit_is_a_row_with_its_reason(
 
     monkeypatch.setattr(stages, "deploy_one", too_long)
     case = run(arteries[0], tmp_path / "out", settings, quiet)
-    assert set(case.deployments) == {"enterprise"}
+    assert set(case.implants) == {"enterprise"}
     assert case.failures == {"silk": "not deployed: No size of Silk fits: choose another device."}
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["failures"] == case.failures
     assert case.notes[0] == f"silk: {case.failures['silk']}"
@@ -170,7 +173,10 @@ def test_a_device_that_does_not_fit_is_a_row_with_its_reason(
 def test_a_flow_that_diverges_is_a_row_with_its_reason(
     arteries: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings, real = replace(PLAIN, devices=("silk", "enterprise"), flow=FLOW), stages.simulate_case
+    settings, real = (
+        replace(PLAIN, treatments=(with_device("silk"), with_device("enterprise")), flow=FLOW),
+        stages.simulate_case,
+    )
 
     def diverging(case: FlowCase, **given: object) -> FlowField:
         if case.solids and case.solids[0].design.key == "silk":
@@ -181,7 +187,7 @@ def test_a_flow_that_diverges_is_a_row_with_its_reason(
     case = run(arteries[0], tmp_path, settings, quiet)
     assert set(case.fields) == {"bare", "enterprise"}
     assert case.failures == {"silk": "flow not computed: the flow diverged: use a finer grid spacing"}
-    assert "deployment" in case.metrics["stents"]["silk"]
+    assert "implants" in case.metrics["treatments"]["silk"]
 
 
 def test_keys_change_with_what_a_stage_uses_and_with_nothing_else() -> None:
@@ -230,7 +236,7 @@ def test_a_ranking_of_another_device_keeps_the_rows_of_the_former_one(
 
 
 def test_a_point_in_another_frame_is_recognized(arteries: tuple[Path, Path], tmp_path: Path) -> None:
-    surface, _ = read_surface(arteries[0], units="mm")
+    surface, _ = read_surface(arteries[0], input=InputSettings(units="mm"))
     moved = tmp_path / "moved.stl"
     write_stl(moved, Surface(surface.vertices_mm + np.array([40.0, 25.0, 0.0]), surface.faces))
     anatomy, _ = restore_vessel(moved, tmp_path / "out", PLAIN, quiet)
