@@ -107,10 +107,11 @@ key = "plugged"
 name = "Plugged in"
 maker = "a test"
 kind = "braid"
-wires = [{ count = 48, diameter_um = 30, source = "none", confidence = "estimated" }]
-braid_angle_rad = { value = 1.15, source = "none", confidence = "estimated" }
-free_diameter_margin_mm = { value = 0.2, source = "none", confidence = "estimated" }
-sizes = [{ diameters_mm = [4.0], lengths_mm = [15], source = "none", confidence = "estimated" }]
+wires = [{ count = { value = 48, low = 48, high = 48 }, diameter_um = { value = 30, low = 28, high = 32 }, \\
+source = "none", confidence = "estimated", reason = "none" }]
+braid_angle_rad = { value = 1.15, low = 1, high = 1.2, source = "none", confidence = "estimated", reason = "none" }
+free_diameter_margin_mm = { value = 0.2, low = 0, high = 0.3, source = "none", confidence = "estimated", reason = "none" }
+sizes = [{ diameters_mm = [4.0], lengths_mm = [15], length_tolerance_mm = 1, source = "none", confidence = "estimated", reason = "none" }]
 """
 
 
