@@ -167,12 +167,20 @@ def test_a_catalogue_entry_becomes_a_design():
             "5 wires of 40 um",
         ),
         ("um = { value = 40", "um = { value = 0.04", "0.04 um is thinner than any wire or strut, give micrometres"),
-        ("value = 40, low = 20, high = 50", "value = 900, low = 20, high = 900", "has no room for its wires or struts: side by side they take 1."),
+        (
+            "value = 40, low = 20, high = 50",
+            "value = 900, low = 20, high = 900",
+            "has no room for its wires or struts: side by side they take 1.",
+        ),
         ("lengths_mm = [10,", "lengths_mm = [1,", "3.00 x 1 mm is shorter than two rows of its cells, which are 0."),
         ('key = "x"', 'key = "bare"', "'bare', which is reserved for the flow without a device"),
         ('name = "X"', 'name = "Bare"', "'bare', which is reserved for the flow without a device"),
         ("low = 0.9, ", "", "braid_angle_rad.low"),
-        ('high = 1.1, source = "here", confidence = "estimated", reason = "why"', f"high = 1.1, {SOURCED}", "rad.reason"),
+        (
+            'high = 1.1, source = "here", confidence = "estimated", reason = "why"',
+            f"high = 1.1, {SOURCED}",
+            "rad.reason",
+        ),
         ("low = 0.9", "low = 1.05", "the range 1.05 to 1.1 does not contain the value 1"),
         ("value = 40,", 'value = 40, source = "bench",', "source and confidence go together"),
         ("value = 0.1,", "value = 1.6,", "free_diameter_margin_mm"),
@@ -296,8 +304,8 @@ maker = "me"
 kind = "braid"
 wires = [{ count = { value = 64, low = 64, high = 64 }, diameter_um = { value = 25, low = 23, high = 27 }, \
 source = "drawing 7", confidence = "cited", reason = "tolerance" }]
-braid_angle_rad = { value = 1.2, low = 1.1, high = 1.3, source = "bench", confidence = "derived", reason = "two errors" }
-free_diameter_margin_mm = { value = 0.1, low = 0, high = 0.2, source = "drawing 7", confidence = "cited", reason = "drawn" }
+braid_angle_rad = { value = 1.2, low = 1.1, high = 1.3, source = "bench", confidence = "derived", reason = "fit" }
+free_diameter_margin_mm = { value = 0.1, low = 0, high = 0.2, source = "bench", confidence = "cited", reason = "fit" }
 sizes = [{ diameters_mm = [3.0], lengths_mm = [10, 20], length_tolerance_mm = 1, \
 source = "drawing 7", confidence = "cited", reason = "rounding" }]
 """
@@ -319,8 +327,8 @@ def test_a_device_of_ones_own_joins_the_catalogue_and_can_be_replaced(own_folder
     assert "Own" in capsys.readouterr().out
     assert set(catalogue.catalogue()) - before == {"own"}
     assert catalogue.find_design("Own").wires == ((64, 25.0),)
-    assert {fact.source for fact in catalogue.find_design("own").facts} == {"drawing 7", "measured on a bench"}
-    file.write_text(OWN.replace("diameter_um = 25", "diameter_um = 26"))
+    assert {fact.source for fact in catalogue.find_design("own").facts} == {"drawing 7", "bench"}
+    file.write_text(OWN.replace("value = 25", "value = 26"))
     assert main(["devices", "add", str(file)]) == 0
     assert catalogue.find_design("own").wires == ((64, 26.0),)
     assert [path.name for path in own_folder.iterdir()] == ["mine.toml"]
@@ -335,7 +343,7 @@ def test_a_device_of_ones_own_joins_the_catalogue_and_can_be_replaced(own_folder
             "names a device that the catalogue already has, silk. Give it another key and",
         ),
         (OWN.replace(', confidence = "derived"', ""), "is wrong at device.0.braid.braid_angle_rad.confidence"),
-        (OWN.replace("value = 1.2", "value = 2.0"), "has an angle of 2.000 rad"),
+        (OWN.replace("value = 1.2, low = 1.1, high = 1.3", "value = 2.0, low = 1.9, high = 2.1"), "has an angle of 2.000 rad"),
         (OWN.replace("]]", "]"), "is not valid TOML"),
         (None, "does not exist"),
     ],

@@ -151,11 +151,11 @@ class _Writer:
         by_place = {round(where, 6): round(wider, 6) for where, wider in pairs}
         is_flare = all(by_place.get(round(1 - where, 6)) == wider for where, wider in by_place.items())
         if not is_flare:
-            return {"fractions": list(by_place), "wider_mm": list(by_place.values())} | kept
+            return kept | {"fractions": list(by_place), "wider_mm": list(by_place.values())}
         beyond_mm = sum(2 * one.beyond_mm for one in getattr(self.like, "strands", ()))
         near = {where: wider for where, wider in by_place.items() if where <= 0.5}
         from_ends_mm = [round(where * (size.length_mm + beyond_mm), 4) for where in near]
-        return {"from_ends_mm": from_ends_mm, "wider_mm": list(near.values())} | kept
+        return kept | {"from_ends_mm": from_ends_mm, "wider_mm": list(near.values())}
 
     def sizes(self, has_all: bool) -> list[dict[str, Any]]:
         """Return the blocks of sizes."""
