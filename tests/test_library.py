@@ -14,11 +14,9 @@ import pytest
 from faults import artery
 
 import vstent
-from vstent import plugins
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
-from vstent.deployment.braid import ConstantWire
 from vstent.deployment.deploy import deploy
 from vstent.devices import catalogue
 from vstent.devices.stent import Deployment, Landing
@@ -107,27 +105,13 @@ key = "plugged"
 name = "Plugged in"
 maker = "a test"
 kind = "braid"
-wires = [{ count = 48, diameter_um = 30, source = "none", confidence = "estimated" }]
-braid_angle_rad = { value = 1.15, source = "none", confidence = "estimated" }
-free_diameter_margin_mm = { value = 0.2, source = "none", confidence = "estimated" }
-sizes = [{ diameters_mm = [4.0], lengths_mm = [15], source = "none", confidence = "estimated" }]
+wires = [{ count = { value = 48, low = 48, high = 48 }, diameter_um = { value = 30, low = 28, high = 32 }, \\
+source = "none", confidence = "estimated", reason = "none" }]
+braid_angle_rad = { value = 1.15, low = 1, high = 1.2, source = "none", confidence = "estimated", reason = "why" }
+free_diameter_margin_mm = { value = 0.2, low = 0, high = 0.3, source = "none", confidence = "derived", reason = "why" }
+sizes = [{ diameters_mm = [4.0], lengths_mm = [15], length_tolerance_mm = 1, \\
+source = "none", confidence = "estimated", reason = "none" }]
 """
-
-
-class CountingWall:
-    """The wall itself, and how often it was asked."""
-
-    asked = 0
-
-    def __init__(self, surface):
-        self.tree = TreeWall(surface)
-
-    def contact(self, points_mm):
-        CountingWall.asked += 1
-        return self.tree.contact(points_mm)
-
-    def crosses(self, starts_mm, ends_mm):
-        return self.tree.crosses(starts_mm, ends_mm)
 
 
 class Still(AbstractEngine):
@@ -164,15 +148,14 @@ class Still(AbstractEngine):
 
 @pytest.fixture
 def distribution(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A distribution, tiny but whole, that plugs in a device, an engine and a wall."""
+    """A distribution, tiny but whole, that plugs in a device and an engine."""
     (tmp_path / "tiny_plugin.py").write_text(PLUGIN)
     info = tmp_path / "tiny_plugin-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: tiny-plugin\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(
         "[vstent.devices]\ntiny = tiny_plugin:devices\n\n"
-        "[vstent.engines]\nstill = tiny_plugin:Still\nmissing = tiny_plugin:Nothing\n\n"
-        "[vstent.walls]\ncounting = tiny_plugin:CountingWall\n"
+        "[vstent.engines]\nstill = tiny_plugin:Still\nmissing = tiny_plugin:Nothing\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "tiny_plugin", raising=False)
@@ -197,14 +180,6 @@ def test_a_device_that_is_plugged_in_twice_is_refused(distribution: Path) -> Non
 
 
 @pytest.mark.usefixtures("distribution")
-def test_a_wall_is_plugged_in_and_gives_the_same_deployment(anatomy: Anatomy) -> None:
-    design = vstent.find_design("silk")
-    plain, plugged = deploy(design, anatomy), deploy(design, anatomy, method=ConstantWire(wall="counting"))
-    assert plugins.load("vstent.walls", "counting", built_in="tree").asked > 2
-    np.testing.assert_array_equal(plain.stent.nodes_mm, plugged.stent.nodes_mm)
-
-
-@pytest.mark.usefixtures("distribution")
 def test_a_flow_engine_is_plugged_in(anatomy: Anatomy, tmp_path: Path) -> None:
     case = flow_case(anatomy, (), FlowSettings(numerics=Numerics(engine="still", cell_size_mm=3.0)))
     assert simulate_case(case) == ("still", 3.0, True)
@@ -221,8 +196,6 @@ def test_plugins_that_are_not_there_are_named(anatomy: Anatomy) -> None:
         simulate_case(flow_case(anatomy, (), FlowSettings(numerics=Numerics(engine="stil", cell_size_mm=3.0))))
     with pytest.raises(PluginError, match=r"missing of vstent.engines cannot be loaded"):
         simulate_case(flow_case(anatomy, (), FlowSettings(numerics=Numerics(engine="missing", cell_size_mm=3.0))))
-    with pytest.raises(PluginError, match=r"no 'x' in vstent.walls: choose one of tree, counting"):
-        deploy(vstent.find_design("silk"), anatomy, method=ConstantWire(wall="x"))
 
 
 def test_two_threads_deploy_as_one_does(anatomy: Anatomy) -> None:

@@ -1,11 +1,9 @@
-"""Plug-ins: entry points of other packages, in three groups.
+"""Plug-ins: entry points of other packages, in two groups.
 
 ``vstent.devices``: a function that returns a device catalogue as TOML text in which every number has its source.
 
 ``vstent.engines``: a class derived from `vstent.flow.engines.AbstractEngine`, created with the grid spacing in mm and a
 folder that it may write to.
-
-``vstent.walls``: a class derived from `vstent.deployment.wall.AbstractWall`, created with the surface.
 """
 
 from importlib.metadata import EntryPoint, entry_points
@@ -13,7 +11,7 @@ from typing import Any, Literal
 
 from vstent.errors import PluginError
 
-Group = Literal["vstent.devices", "vstent.engines", "vstent.walls"]
+Group = Literal["vstent.devices", "vstent.engines"]
 """Entry point groups."""
 
 

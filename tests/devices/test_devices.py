@@ -115,13 +115,6 @@ def test_the_values_of_the_ranges_are_those_of_the_device():
         assert same.free_diameter_mm == pytest.approx(size.free_diameter_mm, abs=1e-9)
 
 
-def test_a_catalogue_without_ranges_is_read_and_said_to_lack_them():
-    design = device_schema.parse(ENTRY)["x"]
-    assert design.ranges == ()
-    assert "no range for wire_count, wire_diameter_um, braid_angle_rad, free_" in ranges.how_sure(design)
-    assert "no range" not in ranges.how_sure(catalogue.find_design("silk"))
-
-
 def test_an_unknown_device_is_answered_with_the_nearest_and_the_list():
     with pytest.raises(DeviceError, match=r"no device called 'silc'\. Did you mean silk\? Choose one of: accero"):
         catalogue.find_design("silc")
@@ -136,17 +129,19 @@ def test_an_unknown_size_is_answered_with_what_there_is():
     assert catalogue.find_size(silk, diameter_mm=4, length_mm=20) == Size(4.0, 20.0, 4.2)
 
 
-ENTRY = """
+SOURCED = 'source = "here", confidence = "estimated"'
+RANGED = f'{SOURCED}, reason = "why"'
+ENTRY = f"""
 [[device]]
 key = "x"
 name = "X"
 maker = "Y"
 kind = "braid"
-wires = [{ count = 12, diameter_um = 40, source = "here", confidence = "estimated" }]
-braid_angle_rad = { value = 1.0, source = "here", confidence = "estimated" }
-free_diameter_margin_mm = { value = 0.1, source = "here", confidence = "estimated" }
-sizes = [{ diameters_mm = [3, 4], lengths_mm = [10, 20], source = "here", confidence = "cited" }]
-"""
+wires = [{{ count = {{ value = 12, low = 2, high = 90 }}, diameter_um = {{ value = 40, low = 20, high = 50 }}, {RANGED} }}]
+braid_angle_rad = {{ value = 1.0, low = 0.9, high = 1.1, {RANGED} }}
+free_diameter_margin_mm = {{ value = 0.1, low = 0.0, high = 0.2, {RANGED} }}
+sizes = [{{ diameters_mm = [3, 4], lengths_mm = [10, 20], length_tolerance_mm = 1, source = "here", confidence = "cited", reason = "why" }}]
+"""  # noqa: E501 a block of sizes in one line
 
 
 def test_a_catalogue_entry_becomes_a_design():
@@ -159,33 +154,37 @@ def test_a_catalogue_entry_becomes_a_design():
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ('source = "here", confidence = "estimated" }]', 'confidence = "estimated" }]', "wires.0.source"),
+        ('50 }, source = "here", confidence', "50 }, confidence", "wires.0.source"),
         ('confidence = "cited"', 'confidence = "sure"', "confidence"),
-        ("count = 12", "count = 0", "wires.0.count"),
+        ("count = { value = 12", "count = { value = 0", "wires.0.count"),
         ("value = 1.0", "value = -1.0", "braid_angle_rad"),
         ('maker = "Y"', 'maker = "Y"\nprice = 3', "price"),
-        ("count = 12", "count = 13", "13 wires"),
+        ("value = 12", "value = 13", "13 wires"),
         (
-            "wires = [{ count = 12,",
-            'wires = [{ count = 5, diameter_um = 40, source = "here", confidence = "cited" }, { count = 7,',
+            "wires = [{ count = { value = 12",
+            "wires = [{ count = { value = 5, low = 5, high = 5 }, diameter_um = { value = 40, low = 40, high = 40 }, "
+            f"{RANGED} }}, {{ count = {{ value = 7",
             "5 wires of 40 um",
         ),
-        ("diameter_um = 40", "diameter_um = 0.04", "0.04 um is thinner than any wire or strut, give micrometres"),
-        ("diameter_um = 40", "diameter_um = 900", "has no room for its wires or struts: side by side they take 1."),
+        ("um = { value = 40", "um = { value = 0.04", "0.04 um is thinner than any wire or strut, give micrometres"),
+        (
+            "value = 40, low = 20, high = 50",
+            "value = 900, low = 20, high = 900",
+            "has no room for its wires or struts: side by side they take 1.",
+        ),
         ("lengths_mm = [10,", "lengths_mm = [1,", "3.00 x 1 mm is shorter than two rows of its cells, which are 0."),
         ('key = "x"', 'key = "bare"', "'bare', which is reserved for the flow without a device"),
         ('name = "X"', 'name = "Bare"', "'bare', which is reserved for the flow without a device"),
-        ("value = 1.0,", "value = 1.0, low = 0.9,", "a range needs its low end, its high end and its reason"),
+        ("low = 0.9, ", "", "braid_angle_rad.low"),
         (
-            "value = 1.0,",
-            "value = 1.0, low = 0.9, high = 1.1,",
-            "a range needs its low end, its high end and its reason",
+            'high = 1.1, source = "here", confidence = "estimated", reason = "why"',
+            f"high = 1.1, {SOURCED}",
+            "rad.reason",
         ),
-        ("value = 1.0,", 'value = 1.0, low = 1.1, high = 1.2, reason = "why",', "does not contain the value 1"),
-        ("diameter_um = 40,", "diameter_um = 40, diameter_low_um = 30,", "a range needs its low end"),
-        ("diameter_um = 40,", 'diameter_um = 40, diameter_source = "bench",', "and diameter_confidence go together"),
+        ("low = 0.9", "low = 1.05", "the range 1.05 to 1.1 does not contain the value 1"),
+        ("value = 40,", 'value = 40, source = "bench",', "source and confidence go together"),
         ("value = 0.1,", "value = 1.6,", "free_diameter_margin_mm"),
-        ("lengths_mm = [10, 20],", "lengths_mm = [10, 20], length_tolerance_mm = 1,", "a range needs"),
+        (" length_tolerance_mm = 1,", "", "length_tolerance_mm"),
         ("[[device]]", "[[device", "not valid TOML"),
     ],
 )
@@ -208,12 +207,13 @@ def test_importing_devices_does_not_load_pydantic():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-SOURCED = 'source = "here", confidence = "estimated"'
+LAYER = "count = { value = 4, low = 4, high = 4 }, diameter_um = { value = 60, low = 50, high = 70 }"
 STRUCTURES = (
-    f"outer_layer = {{ count = 4, diameter_um = 60, beyond_mm = 3.0, {SOURCED} }}\n"
-    f"strands = [{{ count = 2, diameter_um = 50, {SOURCED} }}]\n"
+    f"outer_layer = {{ {LAYER}, beyond_mm = {{ value = 3.0, low = 2.0, high = 4.0 }}, {RANGED} }}\n"
+    "strands = [{ count = { value = 2, low = 2, high = 2 }, diameter_um = { value = 50, low = 45, high = 55 }, "
+    f"{RANGED} }}]\n"
     f"closed_ends = {{ value = true, {SOURCED} }}\n"
-    f"free_profile = {{ from_ends_mm = [0.0, 1.6], wider_mm = [0.4, 0.0], {SOURCED} }}\n"
+    f"free_profile = {{ from_ends_mm = [0.0, 1.6], wider_mm = [0.4, 0.0], wider_tolerance_mm = 0.1, {RANGED} }}\n"
 )
 LASER_CUT = f"""
 [[device]]
@@ -221,40 +221,33 @@ key = "cut"
 name = "Cut"
 maker = "Y"
 kind = "laser_cut"
-n_columns = {{ value = 16, {SOURCED} }}
-strut_width_um = {{ value = 60, {SOURCED} }}
-strut_thickness_um = {{ value = 60, {SOURCED} }}
-cell_angle_rad = {{ value = 0.6, {SOURCED} }}
-free_diameter_margin_mm = {{ value = 0.0, {SOURCED} }}
-sizes = [{{ diameters_mm = [4], lengths_mm = [20], {SOURCED} }}]
+n_columns = {{ value = 16, low = 16, high = 16, {RANGED} }}
+strut_width_um = {{ value = 60, low = 50, high = 70, {RANGED} }}
+strut_thickness_um = {{ value = 60, low = 50, high = 70, {RANGED} }}
+cell_angle_rad = {{ value = 0.6, low = 0.5, high = 0.7, {RANGED} }}
+free_diameter_margin_mm = {{ value = 0.0, low = 0.0, high = 0.1, {RANGED} }}
+sizes = [{{ diameters_mm = [4], lengths_mm = [20], length_tolerance_mm = 0.5, {RANGED} }}]
 joined_crowns = {{ value = ["10", "01"], {SOURCED} }}
-crown_gap_um = {{ value = 150, {SOURCED} }}
-free_profile = {{ fractions = [0.0, 1.0], wider_mm = [0.5, -0.5], {SOURCED} }}
+crown_gap_um = {{ value = 150, low = 80, high = 300, {RANGED} }}
+free_profile = {{ fractions = [0.0, 1.0], wider_mm = [0.5, -0.5], wider_tolerance_mm = 0.1, {RANGED} }}
 """
 
 
-def test_a_diameter_may_have_a_source_and_a_confidence_beside_those_of_its_count():
-    own = (
-        'diameter_um = 40, diameter_low_um = 35, diameter_high_um = 45, count_low = 12, count_high = 12, reason = "why"'
-    )
-    own += ', diameter_source = "bench", diameter_confidence = "derived"'
-    layer = STRUCTURES.replace(
-        "beyond_mm = 3.0", 'beyond_mm = 3.0, beyond_source = "leaflet", beyond_confidence = "cited"'
-    )
-    design = device_schema.parse(ENTRY.replace("diameter_um = 40", own) + layer)["x"]
+def test_a_number_of_wires_may_have_a_source_and_a_confidence_of_its_own():
+    own = 'value = 40, source = "bench", confidence = "derived",'
+    layer = STRUCTURES.replace("value = 3.0,", 'value = 3.0, source = "leaflet", confidence = "cited",')
+    design = device_schema.parse(ENTRY.replace("value = 40,", own) + layer)["x"]
     told = {fact.name: (fact.source, fact.confidence) for fact in design.facts}
     assert told["wires"] == ("here", "estimated")
     assert told["wires_diameter_um"] == ("bench", "derived")
     assert told["outer_layer_beyond_mm"] == ("leaflet", "cited")
-    assert {one.name: one.confidence for one in design.ranges} == {
-        "wire_count": "estimated",
-        "wire_diameter_um": "derived",
-    }
+    sure = {one.name: one.confidence for one in design.ranges}
+    assert (sure["wire_count"], sure["wire_diameter_um"]) == ("estimated", "derived")
+    assert (sure["outer_layer_diameter_um"], sure["outer_layer_beyond_mm"]) == ("estimated", "cited")
 
 
 def test_blocks_of_sizes_of_one_source_count_once():
-    block = '{ diameters_mm = [3, 4], lengths_mm = [10, 20], source = "here", confidence = "cited" }'
-    assert block in ENTRY
+    block = ENTRY[ENTRY.index("{ diameters_mm") : ENTRY.rindex("]")]
     second, third = block.replace("[3, 4]", "[5]"), block.replace("[3, 4]", "[6]").replace("here", "there")
     design = device_schema.parse(ENTRY.replace(block, f"{block}, {second}, {third}"))["x"]
     assert [fact.source for fact in design.facts if fact.name == "sizes"] == ["here", "there"]
@@ -288,8 +281,8 @@ def test_structures_are_read_with_their_sources_and_their_ranges_change_them():
     [
         ("from_ends_mm = [0.0, 1.6]", "fractions = [0.0]", "as many increasing places"),
         ("from_ends_mm = [0.0, 1.6], ", "", "give the places of wider_mm"),
-        ("beyond_mm = 3.0", "beyond_mm = -3.0", "outer_layer"),
-        ("strands = [{ count = 2", "strands = [{ count = 5", "even number"),
+        ("value = 3.0, low", "value = -3.0, low", "outer_layer"),
+        ("{ value = 2, low = 2, high = 2", "{ value = 5, low = 5, high = 5", "even number"),
     ],
 )
 def test_a_wrong_structure_is_refused_with_its_place(before, after, said):
@@ -309,10 +302,12 @@ key = "own"
 name = "Own"
 maker = "me"
 kind = "braid"
-wires = [{ count = 64, diameter_um = 25, source = "drawing 7", confidence = "cited" }]
-braid_angle_rad = { value = 1.2, source = "measured on a bench", confidence = "derived" }
-free_diameter_margin_mm = { value = 0.1, source = "drawing 7", confidence = "cited" }
-sizes = [{ diameters_mm = [3.0], lengths_mm = [10, 20], source = "drawing 7", confidence = "cited" }]
+wires = [{ count = { value = 64, low = 64, high = 64 }, diameter_um = { value = 25, low = 23, high = 27 }, \
+source = "drawing 7", confidence = "cited", reason = "tolerance" }]
+braid_angle_rad = { value = 1.2, low = 1.1, high = 1.3, source = "bench", confidence = "derived", reason = "fit" }
+free_diameter_margin_mm = { value = 0.1, low = 0, high = 0.2, source = "bench", confidence = "cited", reason = "fit" }
+sizes = [{ diameters_mm = [3.0], lengths_mm = [10, 20], length_tolerance_mm = 1, \
+source = "drawing 7", confidence = "cited", reason = "rounding" }]
 """
 
 
@@ -332,8 +327,8 @@ def test_a_device_of_ones_own_joins_the_catalogue_and_can_be_replaced(own_folder
     assert "Own" in capsys.readouterr().out
     assert set(catalogue.catalogue()) - before == {"own"}
     assert catalogue.find_design("Own").wires == ((64, 25.0),)
-    assert {fact.source for fact in catalogue.find_design("own").facts} == {"drawing 7", "measured on a bench"}
-    file.write_text(OWN.replace("diameter_um = 25", "diameter_um = 26"))
+    assert {fact.source for fact in catalogue.find_design("own").facts} == {"drawing 7", "bench"}
+    file.write_text(OWN.replace("value = 25", "value = 26"))
     assert main(["devices", "add", str(file)]) == 0
     assert catalogue.find_design("own").wires == ((64, 26.0),)
     assert [path.name for path in own_folder.iterdir()] == ["mine.toml"]
@@ -348,7 +343,7 @@ def test_a_device_of_ones_own_joins_the_catalogue_and_can_be_replaced(own_folder
             "names a device that the catalogue already has, silk. Give it another key and",
         ),
         (OWN.replace(', confidence = "derived"', ""), "is wrong at device.0.braid.braid_angle_rad.confidence"),
-        (OWN.replace("value = 1.2", "value = 2.0"), "has an angle of 2.000 rad"),
+        (OWN.replace("value = 1.2, low = 1.1, high = 1.3", "value = 2.0, low = 1.9, high = 2.1"), "has an angle of 2.000 rad"),
         (OWN.replace("]]", "]"), "is not valid TOML"),
         (None, "does not exist"),
     ],

@@ -429,16 +429,17 @@ SHAPE, OPTION, DEVICE, MACHINE = "surfaces that are read", "options", "devices o
 _TORN = "holds no surface, or fewer triangles"
 _ANNOUNCED = "breaks off"
 _DAMAGED = "is damaged"
-_SOURCED = 'source = "none", confidence = "estimated"'
+_SOURCED = 'source = "none", confidence = "estimated", reason = "none"'
 
 
 def _device(angle: str = "1.1", count: str = "48", lengths: str = "[15]", more: str = "") -> str:
     return (
         '[[device]]\nkey = "mine"\nname = "Mine"\nmaker = "Me"\nkind = "braid"\n'
-        f"wires = [{{ count = {count}, diameter_um = 30, {_SOURCED} }}]\n"
-        f"braid_angle_rad = {{ value = {angle}, {_SOURCED} }}\n"
-        f"free_diameter_margin_mm = {{ value = 0.2, {_SOURCED} }}\n"
-        f"sizes = [{{ diameters_mm = [4], lengths_mm = {lengths}, {_SOURCED} }}]\n{more}"
+        f"wires = [{{ count = {{ value = {count}, low = 2, high = 100 }}, "
+        f"diameter_um = {{ value = 30, low = 20, high = 40 }}, {_SOURCED} }}]\n"
+        f"braid_angle_rad = {{ value = {angle}, low = 1.0, high = 1.2, {_SOURCED} }}\n"
+        f"free_diameter_margin_mm = {{ value = 0.2, low = 0.1, high = 0.3, {_SOURCED} }}\n"
+        f"sizes = [{{ diameters_mm = [4], lengths_mm = {lengths}, length_tolerance_mm = 1, {_SOURCED} }}]\n{more}"
     )
 
 
@@ -690,7 +691,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         DEVICE,
         "number without source",
-        toml(_device().replace(_SOURCED, 'confidence = "cited"', 1)),
+        toml(_device().replace(_SOURCED, 'confidence = "cited", reason = "none"', 1)),
         INPUT,
         "source",
         own_catalogue,

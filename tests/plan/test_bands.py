@@ -123,7 +123,7 @@ def test_a_band_contains_the_result_it_belongs_to():
         assert band.low <= lying()[1][name] <= band.high, name
 
 
-def test_a_device_without_ranges_has_no_bands_and_says_so():
+def test_a_device_whose_numbers_are_exact_has_no_bands():
     deployment, measures = lying()
     bare = replace(deployment, stent=replace(deployment.stent, design=replace(SILK, ranges=())))
     assert bands(straight(), bare, measures).metrics() == {"results": {}}

@@ -83,7 +83,7 @@ def remember(arguments: argparse.Namespace, before: Begun, told: Mapping[str, An
 
     if any(getattr(arguments, name, False) for name in DEPENDENT):
         return
-    if plugins("vstent.devices") or plugins("vstent.engines") or plugins("vstent.walls"):
+    if plugins("vstent.devices") or plugins("vstent.engines"):
         return  # their code may change too
     with suppress(OSError, FolderError), claimed(arguments.out):
         if is_of_another(arguments.out, told):

@@ -84,7 +84,7 @@ def deploy(
     design = find_design(design) if isinstance(design, str) else design
     chosen = _method(method).beside(design.wall_offset_um * MM_PER_UM)
     size = compacted(design, size or propose_size(design, anatomy), compaction_fraction)
-    wall, is_patient = landing_wall(anatomy, inside, chosen.wall)
+    wall, is_patient = landing_wall(anatomy, inside)
 
     def opened_at(there: Landing) -> Course:
         return run(chosen, Placement(design, size, there, anatomy, wall), progress)

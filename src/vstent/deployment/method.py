@@ -11,7 +11,7 @@ import numpy as np
 from vstent.deployment.active_contour import ActiveContour, State
 from vstent.deployment.contour import Planes, circles, planes
 from vstent.deployment.crowns import Crowns
-from vstent.deployment.wall import TREE, AbstractWall
+from vstent.deployment.wall import AbstractWall
 from vstent.devices.design import Design, Size
 from vstent.devices.formulas import grid
 from vstent.devices.stent import Landing
@@ -113,8 +113,6 @@ class AbstractMethod(ABC):
 
     contour: ActiveContour = field(default_factory=ActiveContour)
     """Active contour that carries the device to the wall, with its weights (Zhong et al. 2016, eq. 1-7)."""
-    wall: str = TREE
-    """How the wall is searched: ``tree``, or the name of a plug-in (`vstent.plugins`)."""
 
     def beside(self, dd_mm: float) -> Self:
         """Return the method with the distance `dd_mm`, in mm, between contour and wall."""

@@ -7,7 +7,6 @@ from typing import Final, NamedTuple, final
 
 import numpy as np
 
-from vstent import plugins
 from vstent.deployment.contour import normals
 from vstent.devices.stent import Stent
 from vstent.geometry.surface import Surface
@@ -16,8 +15,6 @@ from vstent.kernels import curves
 from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.units import MM_PER_UM
 
-TREE: Final = "tree"
-"""Name of the built-in wall search, by a tree of bounding boxes."""
 OVERLAP_MM: Final = 0.5
 """Length, in mm, by which the artery's wall is kept inside each end of a device that is already in it."""
 ON_WALL_MM: Final = 1e-9
@@ -83,7 +80,7 @@ class TreeWall(AbstractWall):
         return self.surface.crosses(starts_mm, ends_mm)
 
 
-def landing_wall(anatomy: Anatomy, inside: Sequence[Stent] = (), search: str = TREE) -> tuple[AbstractWall, Bools]:
+def landing_wall(anatomy: Anatomy, inside: Sequence[Stent] = ()) -> tuple[AbstractWall, Bools]:
     """Build the wall against which a device opens.
 
     It is the landing surface. Where devices are already deployed, it is the inner face of the last of them instead.
@@ -94,8 +91,6 @@ def landing_wall(anatomy: Anatomy, inside: Sequence[Stent] = (), search: str = T
         The artery.
     inside : sequence of Stent, optional
         Devices that are already in the artery, in the order of their deployment.
-    search : str, optional
-        ``tree``, or the name of a plug-in.
 
     Returns
     -------
@@ -103,13 +98,7 @@ def landing_wall(anatomy: Anatomy, inside: Sequence[Stent] = (), search: str = T
         The wall.
     is_patient : (m,) array of bool
         Faces that are the patient's own wall, neither restored or continued wall nor device.
-
-    Raises
-    ------
-    PluginError
-        There is no plug-in called `search`.
     """
-    kind = TreeWall if search == TREE else plugins.load("vstent.walls", search, built_in=TREE)
     surface = anatomy.parent.landing_surface
     is_patient = anatomy.parent.is_patient_face
     for stent in inside:
@@ -119,7 +108,7 @@ def landing_wall(anatomy: Anatomy, inside: Sequence[Stent] = (), search: str = T
         surface = _joined(Surface(surface.vertices_mm, surface.faces[is_open]), inner_face(stent))
         n_inner = len(surface.faces) - int(is_open.sum())
         is_patient = np.concatenate([is_patient[is_open], np.zeros(n_inner, dtype=bool)])
-    return kind(surface), is_patient
+    return TreeWall(surface), is_patient
 
 
 def inner_face(stent: Stent) -> Surface:

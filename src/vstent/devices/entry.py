@@ -2,12 +2,11 @@
 
 import json
 import re
-from collections.abc import Iterator
 from typing import Any, Final
 
 from vstent.devices.design import Braid, Design, LaserCut
 from vstent.devices.fit import Fitted, labels
-from vstent.devices.ranges import LENGTH, MARGIN, PROFILE
+from vstent.devices.ranges import LENGTH, MARGIN, PROFILE, nth
 
 ERRORS: Final = 2.0
 """Standard errors to either side of a fitted value in its range: 95 % of normal errors lie in it."""
@@ -44,35 +43,32 @@ def entry(fitted: Fitted, like: Design, name: str, *, source: str, has_all_sizes
         TOML text.
     """
     writer = _Writer(fitted, like, source)
-    lines = ["[[device]]", *(f"{key} = {_text(value)}" for key, value in _head(fitted.design, like, name))]
-    lines += writer.wires() if isinstance(fitted.design, Braid) else writer.struts()
-    lines += [*writer.structures(), writer.number(MARGIN), "sizes = [", *writer.sizes(has_all_sizes), "]"]
-    return "\n".join(lines) + "\n"
+    design = fitted.design
+    found: dict[str, Any] = {"key": key_of_name(name), "name": name, "maker": like.maker, "kind": design.kind}
+    found |= writer.braid(design) if isinstance(design, Braid) else writer.laser_cut(design)
+    if like.sizes[0].free_profile_mm:
+        found["free_profile"] = writer.profile()
+    found |= {MARGIN: writer.stated(MARGIN), "sizes": writer.sizes(has_all_sizes)}
+    return "\n".join(["[[device]]", *(f"{key} = {_text(value, lines=True)}" for key, value in found.items())]) + "\n"
 
 
-def _head(design: Design, like: Design, name: str) -> Iterator[tuple[str, str]]:
-    """Yield key, name, maker and kind."""
-    yield from (("key", key_of_name(name)), ("name", name), ("maker", like.maker), ("kind", design.kind))
-
-
-def _text(value: Any) -> str:
-    """Return a value as TOML."""
+def _text(value: Any, *, lines: bool = False) -> str:
+    """Return a value as TOML; tables of a list have lines of their own where `lines` is true."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, dict):
+        return f"{{ {', '.join(f'{key} = {_text(one)}' for key, one in value.items())} }}"
+    if isinstance(value, (list, tuple)) and lines and isinstance(value[0], dict):
+        return "\n".join(["[", *(f"    {_text(one)}," for one in value), "]"])
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(map(_text, value))}]"
     return str(value) if isinstance(value, int) else f"{value:.{DIGITS + 2}g}"
 
 
-def _table(fields: dict[str, Any]) -> str:
-    """Return fields as an inline table of TOML."""
-    return f"{{ {', '.join(f'{key} = {_text(value)}' for key, value in fields.items())} }}"
-
-
 class _Writer:
-    """Writes the numbers of one fitted device."""
+    """Collects the numbers of one fitted device as they stand in its entry."""
 
     def __init__(self, fitted: Fitted, like: Design, source: str) -> None:
         self.fitted, self.like = fitted, like
@@ -88,131 +84,82 @@ class _Writer:
         }
         self.ranges = {one.name: one for one in like.ranges}
 
-    def number(self, name: str) -> str:
-        """Return the line of one number."""
-        return f"{name} = {_table(self._number(name))}"
-
-    def _number(self, name: str) -> dict[str, Any]:
-        """Return value, range, source and confidence of a number: fitted where it is determined, else as it was."""
+    def number(self, name: str, value: Any, digits: int) -> dict[str, Any]:
+        """Return value and range of a number; where it is fitted or counted, with source, confidence and reason."""
         if name in self.by_name:
             value, error = self.by_name[name]
-            by = ERRORS * error
-            ends = {"low": round(value - by, 5), "high": round(value + by, 5)}
+            ends = {"low": round(value - ERRORS * error, digits), "high": round(value + ERRORS * error, digits)}
             told = {"source": f"{self.source}; standard error {error:.2g}", "confidence": "derived", "reason": REASON}
-            return {"value": round(value, 5)} | ends | told
-        value = getattr(self.fitted.design, name)
-        if name == "n_columns" and name in self.fitted.counted:
-            return {"value": value, "low": value, "high": value} | self._counted()
-        return {"value": value} | self._kept(name, name, ("low", "high"))
+            return {"value": round(value, digits)} | ends | told
+        if name in self.fitted.counted:
+            told = {"source": f"counted, as in {self.source}", "confidence": "derived", "reason": "a count"}
+            return {"value": value, "low": value, "high": value} | told
+        one = self.ranges[name]
+        kind = type(value)
+        return {"value": value, "low": kind(one.low), "high": kind(one.high)}
 
-    def _counted(self) -> dict[str, str]:
-        """Return source and confidence of a count."""
-        return {"source": f"counted, as in {self.source}", "confidence": "derived", "reason": "a count"}
-
-    def _kept(self, fact: str, name: str, keys: tuple[str, str], group: int = 0) -> dict[str, Any]:
-        """Return range, source and confidence of a number of the similar device."""
-        facts = [one for one in self.like.facts if one.name == fact]
-        told = facts[min(group, len(facts) - 1)] if facts else None
-        found: dict[str, Any] = {
-            "source": f"{self.like.name}: {told.source}" if told else f"as {self.like.name}",
-            "confidence": told.confidence if told else "estimated",
-        }
-        if name in self.ranges:
-            found |= dict(zip(keys, (self.ranges[name].low, self.ranges[name].high), strict=True))
-            found["reason"] = self.ranges[name].reason
-        return found
-
-    def struts(self) -> list[str]:
-        """Return the lines of columns, widths and angle of a laser-cut device."""
-        assert isinstance(self.fitted.design, LaserCut)
-        return [self.number(name) for name in ("n_columns", "strut_width_um", "strut_thickness_um", "cell_angle_rad")]
-
-    def wires(self) -> list[str]:
-        """Return the lines of wires and angle of a braid."""
-        assert isinstance(self.fitted.design, Braid)
-        groups = [f"    {_table(self._wires(k, *group))}," for k, group in enumerate(self.fitted.design.wires)]
-        return ["wires = [", *groups, "]", self.number("braid_angle_rad")]
-
-    def _wires(self, group: int, count: int, diameter_um: float) -> dict[str, Any]:
-        """Return count, diameter and source of a group of wires."""
-        stem = "wire" if group == 0 else f"wire_{group + 1}"
-        name, ends = f"{stem}_diameter_um", ("diameter_low_um", "diameter_high_um")
-        is_counted = f"{stem}_count" in self.fitted.counted
-        found = {"count": count, "diameter_um": round(diameter_um, 2)} | self._kept("wires", name, ends, group)
-        if is_counted or f"{stem}_count" not in self.ranges:
-            found |= {"count_low": count, "count_high": count}
-        else:
-            one = self.ranges[f"{stem}_count"]
-            found |= {"count_low": int(one.low), "count_high": int(one.high)}
-        if name in self.by_name:
-            value, error = self.by_name[name]
-            found |= {ends[0]: round(value - ERRORS * error, 2), ends[1]: round(value + ERRORS * error, 2)}
-            return found | {"source": self.source, "confidence": "derived", "reason": f"{REASON}; {count} wires"}
-        return found | self._own("wires" if group == 0 else f"wires_{group + 1}", "diameter", "um")
-
-    def _own(self, fact: str, name: str, unit: str) -> dict[str, str]:
-        """Return source and confidence of a number, if the similar device has them beside those of its group."""
-        for one in self.like.facts:
-            if one.name == f"{fact}_{name}_{unit}":
-                return {f"{name}_source": f"{self.like.name}: {one.source}", f"{name}_confidence": one.confidence}
-        return {}
-
-    def structures(self) -> Iterator[str]:
-        """Yield the lines of strands, layers, flares, closed ends and free crowns, as the similar device has them."""
+    def stated(self, name: str) -> dict[str, Any]:
+        """Return a number with source, confidence and reason, of the similar device where it is not fitted."""
         design = self.fitted.design
-        if isinstance(design, Braid):
-            yield from self._strands(design)
-            if design.has_closed_ends:
-                yield f"closed_ends = {_table({'value': True} | self._kept('closed_ends', '', ('', '')))}"
-        elif design.joined_crowns:
-            crowns = {"value": design.joined_crowns} | self._kept("joined_crowns", "", ("", ""))
-            yield f"joined_crowns = {_table(crowns)}"
-            yield self.number("crown_gap_um")
-        if self.like.sizes[0].free_profile_mm:
-            yield f"free_profile = {_table(self._profile())}"
+        value = self.ranges[name].value if name == MARGIN else getattr(design, name)
+        return self._kept(name) | {"reason": self.ranges[name].reason} | self.number(name, value, 5)
 
-    def _strands(self, design: Braid) -> Iterator[str]:
-        """Yield the lines of the strands and of the outer layer of a braid."""
-        beside: list[str] = []
+    def _kept(self, fact: str, group: int = 0) -> dict[str, Any]:
+        """Return source and confidence of a number of the similar device."""
+        facts = [one for one in self.like.facts if one.name == fact]
+        told = facts[min(group, len(facts) - 1)]
+        return {"source": f"{self.like.name}: {told.source}", "confidence": told.confidence}
+
+    def _group(self, fact: str, name: str, numbers: dict[str, Any], group: int = 0) -> dict[str, Any]:
+        """Return a group of wires called `name` with its numbers."""
+        found: dict[str, Any] = {key: self.number(f"{name}_{key}", value, 2) for key, value in numbers.items()}
+        for key, number in found.items():
+            own = [one for one in self.like.facts if one.name == f"{nth(fact, group)}_{key}"]
+            if own and "source" not in number:
+                number |= {"source": f"{self.like.name}: {own[0].source}", "confidence": own[0].confidence}
+        return found | self._kept(fact, group) | {"reason": self.ranges[f"{name}_diameter_um"].reason}
+
+    def braid(self, design: Braid) -> dict[str, Any]:
+        """Return wires, angle, strands, outer layer and closed ends of a braid."""
+        wires = [{"count": count, "diameter_um": diameter_um} for count, diameter_um in design.wires]
+        found: dict[str, Any] = {
+            "wires": [self._group("wires", nth("wire", k), numbers, k) for k, numbers in enumerate(wires)],
+            "braid_angle_rad": self.stated("braid_angle_rad"),
+        }
         for strands in design.strands:
-            is_layer = strands.place == "outside"
-            name = "outer_layer" if is_layer else f"strand_{len(beside) + 1}" if beside else "strand"
-            fact, ends = "outer_layer" if is_layer else "strands", ("diameter_low_um", "diameter_high_um")
-            found = self._kept(fact, f"{name}_diameter_um", ends, len(beside)) | self._ends(
-                f"{name}_count", "count_{}", int
-            )
-            found |= {"count": strands.count, "diameter_um": strands.diameter_um}
-            found |= self._own(fact if is_layer or not beside else f"{fact}_{len(beside) + 1}", "diameter", "um")
-            if is_layer:
-                found |= {"beyond_mm": strands.beyond_mm} | self._ends(f"{name}_beyond_mm", "beyond_{}_mm", float)
-                found |= self._own(fact, "beyond", "mm")
-                yield f"outer_layer = {_table(found)}"
+            numbers = {"count": strands.count, "diameter_um": strands.diameter_um}
+            if strands.place == "outside":
+                numbers["beyond_mm"] = strands.beyond_mm
+                found["outer_layer"] = self._group("outer_layer", "outer_layer", numbers)
             else:
-                beside.append(f"    {_table(found)},")
-        if beside:
-            yield from ("strands = [", *beside, "]")
+                beside = found.setdefault("strands", [])
+                beside.append(self._group("strands", nth("strand", len(beside)), numbers, len(beside)))
+        return found | ({"closed_ends": {"value": True} | self._kept("closed_ends")} if design.has_closed_ends else {})
 
-    def _ends(self, name: str, key: str, kind: type) -> dict[str, Any]:
-        """Return the ends of the range of a number of the similar device, under the keys that `key` makes."""
-        one = self.ranges.get(name)
-        return {} if one is None else {key.format("low"): kind(one.low), key.format("high"): kind(one.high)}
+    def laser_cut(self, design: LaserCut) -> dict[str, Any]:
+        """Return columns, widths, angle and crowns of a laser-cut device."""
+        names = ["n_columns", "strut_width_um", "strut_thickness_um", "cell_angle_rad"]
+        crowns = {"value": design.joined_crowns} | self._kept("joined_crowns") if design.joined_crowns else {}
+        numbers = {name: self.stated(name) for name in names + ["crown_gap_um"] * bool(crowns)}
+        return numbers | ({"joined_crowns": crowns} if crowns else {})
 
-    def _profile(self) -> dict[str, Any]:
+    def profile(self) -> dict[str, Any]:
         """Return the free diameter along the similar device: flared ends by their distance, a taper by fractions."""
-        size, kept = self.like.sizes[0], self._kept("free_profile", PROFILE, ("", "wider_tolerance_mm"))
-        kept.pop("", None)
+        size, one = self.like.sizes[0], self.ranges[PROFILE]
+        kept: dict[str, Any] = self._kept("free_profile") | {"wider_tolerance_mm": one.high, "reason": one.reason}
         pairs = [(where, diameter_mm - size.free_diameter_mm) for where, diameter_mm in size.free_profile_mm]
         by_place = {round(where, 6): round(wider, 6) for where, wider in pairs}
         is_flare = all(by_place.get(round(1 - where, 6)) == wider for where, wider in by_place.items())
         if not is_flare:
-            return {"fractions": list(by_place), "wider_mm": list(by_place.values())} | kept
+            return kept | {"fractions": list(by_place), "wider_mm": list(by_place.values())}
         beyond_mm = sum(2 * one.beyond_mm for one in getattr(self.like, "strands", ()))
         near = {where: wider for where, wider in by_place.items() if where <= 0.5}
         from_ends_mm = [round(where * (size.length_mm + beyond_mm), 4) for where in near]
-        return {"from_ends_mm": from_ends_mm, "wider_mm": list(near.values())} | kept
+        return kept | {"from_ends_mm": from_ends_mm, "wider_mm": list(near.values())}
 
-    def sizes(self, has_all: bool) -> Iterator[str]:
-        """Yield the blocks of sizes."""
+    def sizes(self, has_all: bool) -> list[dict[str, Any]]:
+        """Return the blocks of sizes."""
+        found = []
         for diameter_mm, length_mm in labels(self.fitted.measurements):
             value, error = self.by_name.get(f"{LENGTH} {diameter_mm:g} x {length_mm:g}", (0.0, 0.5))
             told = {
@@ -222,10 +169,10 @@ class _Writer:
             }
             tolerance_mm = round(abs(value) + ERRORS * error, 2)
             block = {"diameters_mm": [diameter_mm], "lengths_mm": [length_mm], "length_tolerance_mm": tolerance_mm}
-            yield f"    {_table(block | told)},"
-        if has_all:
-            for diameter_mm in sorted({size.diameter_mm for size in self.like.sizes}):
-                lengths_mm = sorted(one.length_mm for one in self.like.sizes if one.diameter_mm == diameter_mm)
-                kept = self._kept("sizes", LENGTH, ("", "length_tolerance_mm"))
-                kept.pop("", None)
-                yield f"    {_table({'diameters_mm': [diameter_mm], 'lengths_mm': lengths_mm} | kept)},"
+            found.append(block | told)
+        for diameter_mm in sorted({size.diameter_mm for size in self.like.sizes}) if has_all else ():
+            lengths_mm = sorted(one.length_mm for one in self.like.sizes if one.diameter_mm == diameter_mm)
+            one = self.ranges[LENGTH]
+            told = self._kept("sizes") | {"length_tolerance_mm": one.high, "reason": one.reason}
+            found.append({"diameters_mm": [diameter_mm], "lengths_mm": lengths_mm} | told)
+        return found

@@ -1,4 +1,4 @@
-"""Ranges of the numbers of a device: which are uncertain, which lack a range, and the device with other values."""
+"""Ranges of the numbers of a device: which are uncertain, and the device with other values."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,7 +21,7 @@ def numbers(design: Design) -> tuple[str, ...]:
     if isinstance(design, LaserCut):
         gap = ("crown_gap_um",) if design.joined_crowns else ()
         return ("n_columns", "strut_width_um", "strut_thickness_um", "cell_angle_rad", *gap, *_of_sizes(design))
-    groups = [_nth("wire", number) for number in range(len(design.wires))]
+    groups = [nth("wire", number) for number in range(len(design.wires))]
     named = [f"{group}_{what}" for group in groups for what in ("count", "diameter_um")]
     of_strands = [name for group in _strand_names(design) for name in group if name]
     return (*named, "braid_angle_rad", *of_strands, *_of_sizes(design))
@@ -32,7 +32,7 @@ def _of_sizes(design: Design) -> tuple[str, ...]:
     return (MARGIN, LENGTH, PROFILE) if any(size.free_profile_mm for size in design.sizes) else (MARGIN, LENGTH)
 
 
-def _nth(name: str, number: int) -> str:
+def nth(name: str, number: int) -> str:
     """Return the name of a group of wires, counted from 0: wire, wire_2 and so on."""
     return f"{name}_{number + 1}" if number else name
 
@@ -43,7 +43,7 @@ def _strand_names(braid: Braid) -> list[tuple[str, str, str]]:
     found = []
     for strands in braid.strands:
         is_layer = strands.place == "outside"
-        name = "outer_layer" if is_layer else _nth("strand", beside.index(strands))
+        name = "outer_layer" if is_layer else nth("strand", beside.index(strands))
         found.append((f"{name}_count", f"{name}_diameter_um", f"{name}_beyond_mm" if is_layer else ""))
     return found
 
@@ -51,12 +51,6 @@ def _strand_names(braid: Braid) -> list[tuple[str, str, str]]:
 def uncertain(design: Design) -> tuple[Range, ...]:
     """Return the ranges of a device that contain more than one value."""
     return tuple(one for one in design.ranges if one.is_wide)
-
-
-def without_range(design: Design) -> tuple[str, ...]:
-    """Return the names of the numbers whose catalogue entry states no range."""
-    known = {one.name for one in design.ranges}
-    return tuple(name for name in numbers(design) if name not in known)
 
 
 def values_at(ranges: Sequence[Range], place: Iterable[float]) -> dict[str, float]:
@@ -164,13 +158,7 @@ def _even(count: float) -> int:
 
 
 def how_sure(design: Design) -> str:
-    """Return one sentence on how well the numbers of a device are known, and one more on missing ranges."""
+    """Return one sentence on how well the numbers of a device are known."""
     levels = Counter(fact.confidence for fact in design.facts)
     counted = ", ".join(f"{levels[level]} {level}" for level in ("cited", "derived", "estimated") if levels[level])
-    missing = without_range(design)
-    left = (
-        f" Its catalogue entry states no range for {', '.join(missing)}; their uncertainty is not part of the bands."
-        if missing
-        else ""
-    )
-    return f"Numbers of {design.name}: {counted}.{left}" if counted else f"{design.name} has no sources.{left}"
+    return f"Numbers of {design.name}: {counted}." if counted else f"{design.name} has no sources."

@@ -1,16 +1,14 @@
-"""Schema of the device catalogue: every number has a source, a confidence and a range.
-
-Catalogues of version 0.1 state no ranges. They are read, and their devices have no range for the numbers concerned.
-"""
+"""Schema of the device catalogue: every number has a source, a confidence and a range."""
 
 import tomllib
 from collections.abc import Iterator
 from itertools import pairwise
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Generic, Literal, Self, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from vstent.devices.design import Braid, Confidence, Design, Fact, LaserCut, Range, Size, Strands, called
+from vstent.devices.ranges import LENGTH, MARGIN, PROFILE, nth
 from vstent.devices.treatment import BARE
 from vstent.errors import DeviceError
 
@@ -38,8 +36,11 @@ def _in_um(width: float) -> float:
     return width
 
 
+_Words = Annotated[str, Field(min_length=3)]
 _Width_um = Annotated[float, Field(gt=0, le=LARGEST_UM), AfterValidator(_in_um)]
+_Length_mm = Annotated[float, Field(ge=0, le=LARGEST_MM)]
 _Margin_mm = Annotated[float, Field(ge=-LARGEST_MARGIN_MM, le=LARGEST_MARGIN_MM)]
+Value = TypeVar("Value", int, float)
 _Lengths_mm = Annotated[list[Annotated[float, Field(gt=0, le=LARGEST_MM)]], Field(min_length=1, max_length=MOST_SIZES)]
 
 
@@ -50,141 +51,71 @@ class _Strict(BaseModel):
 
 
 class _Sourced(_Strict):
-    """Entry with a source, a confidence and the reason for its range."""
+    """Entry with a source and a confidence."""
 
-    source: str = Field(min_length=3)
+    source: _Words
     confidence: Confidence
-    reason: Annotated[str, Field(min_length=3)] | None = None
+
+
+class _Number(_Strict, Generic[Value]):
+    """Number of a group with its range. Source and reason are those of the group, unless it has its own."""
+
+    value: Value
+    low: Value
+    """Smallest plausible value."""
+    high: Value
+    """Largest plausible value."""
+    source: _Words | None = None
+    confidence: Confidence | None = None
+    reason: _Words | None = None
     """Tolerance or class from which the range follows."""
 
-    def _range(
-        self, name: str, value: float, ends: tuple[float | None, float | None], sure: Confidence | None = None
-    ) -> Iterator[Range]:
-        """Yield the range of one number, if it is stated, with a confidence of its own or that of the entry."""
-        if ends[0] is not None and ends[1] is not None:
-            yield Range(name, value, ends[0], ends[1], self.reason or "", sure or self.confidence)
-
-    def _check_range(self, value: float, ends: tuple[float | None, float | None]) -> None:
-        """Raise a ValueError if a range lacks an end or its reason, or does not contain the value."""
-        if ends == (None, None):
-            return
-        if ends[0] is None or ends[1] is None or self.reason is None:
-            raise ValueError("a range needs its low end, its high end and its reason")
-        if not ends[0] <= value <= ends[1]:
-            raise ValueError(f"the range {ends[0]:g} to {ends[1]:g} does not contain the value {value:g}")
-
-
-class _Ranged(_Sourced):
-    """Entry of one number with its range."""
-
-    value: FiniteFloat
-    low: FiniteFloat | None = None
-    """Smallest plausible value."""
-    high: FiniteFloat | None = None
-    """Largest plausible value."""
-
     @model_validator(mode="after")
-    def _check(self) -> "_Ranged":
-        """Return the entry, or raise a ValueError if its range is invalid."""
-        self._check_range(self.value, (self.low, self.high))
+    def _check(self) -> Self:
+        """Return the number, or raise a ValueError if its range or its source is invalid."""
+        if not self.low <= self.value <= self.high:
+            raise ValueError(f"the range {self.low:g} to {self.high:g} does not contain the value {self.value:g}")
+        if (self.source is None) != (self.confidence is None):
+            raise ValueError("source and confidence go together")
         return self
 
-    def ranges(self, name: str) -> Iterator[Range]:
-        """Yield the range of the number, if it is stated."""
-        yield from self._range(name, self.value, (self.low, self.high))
 
+class _Stated(_Number[Value], Generic[Value]):
+    """Number with its own source, confidence and reason."""
 
-class _Number(_Ranged):
-    """Positive number."""
-
-    value: _Positive
-
-
-class _Width(_Ranged):
-    """Width or thickness of a strut, in um."""
-
-    value: _Width_um
-    low: _Width_um | None = None
-    high: _Width_um | None = None
-
-
-class _Count(_Ranged):
-    """Number of wires or columns."""
-
-    value: _Whole
-    low: _Whole | None = None
-    high: _Whole | None = None
-
-
-class _Margin(_Ranged):
-    """Free diameter minus label diameter, in mm."""
-
-    value: _Margin_mm
-    low: _Margin_mm | None = None
-    high: _Margin_mm | None = None
+    source: _Words
+    confidence: Confidence
+    reason: _Words
 
 
 class _Wires(_Sourced):
     """Group of equal wires; their diameter may have a source of its own, because makers publish the count alone."""
 
-    count: _Whole
-    count_low: _Whole | None = None
-    count_high: _Whole | None = None
-    diameter_um: _Width_um
-    diameter_low_um: _Width_um | None = None
-    diameter_high_um: _Width_um | None = None
-    diameter_source: Annotated[str, Field(min_length=3)] | None = None
-    diameter_confidence: Confidence | None = None
-
-    @model_validator(mode="after")
-    def _check(self) -> "_Wires":
-        """Return the entry, or raise a ValueError if a range is invalid or a source lacks its confidence."""
-        self._check_range(self.count, (self.count_low, self.count_high))
-        self._check_range(self.diameter_um, (self.diameter_low_um, self.diameter_high_um))
-        _check_pair("diameter", self.diameter_source, self.diameter_confidence)
-        return self
+    reason: _Words
+    count: _Number[_Whole]
+    diameter_um: _Number[_Width_um]
 
     def ranges(self, name: str) -> Iterator[Range]:
-        """Yield the stated ranges of count and diameter of wires called `name`."""
-        yield from self._range(f"{name}_count", self.count, (self.count_low, self.count_high))
-        ends_um = self.diameter_low_um, self.diameter_high_um
-        yield from self._range(f"{name}_diameter_um", self.diameter_um, ends_um, self.diameter_confidence)
+        """Yield the ranges of the numbers of wires called `name`."""
+        for key in type(self).model_fields:
+            number = getattr(self, key)
+            if isinstance(number, _Number):
+                yield _range(f"{name}_{key}", number, self)
 
-    def sources(self, name: str, number: int = 0) -> Iterator[Fact]:
-        """Yield the source of a group of `name`, counted from 0, and that of its diameter if it has its own."""
-        yield Fact(name, self.source, self.confidence)
-        if self.diameter_source is not None and self.diameter_confidence is not None:
-            yield Fact(f"{_nth(name, number)}_diameter_um", self.diameter_source, self.diameter_confidence)
+    def facts(self, name: str, number: int = 0) -> Iterator[Fact]:
+        """Yield the source of a group of `name`, counted from 0, and those of numbers that have their own."""
+        yield _fact(name, self)
+        for key in type(self).model_fields:
+            one = getattr(self, key)
+            if isinstance(one, _Number) and one.source is not None and one.confidence is not None:
+                yield Fact(f"{nth(name, number)}_{key}", one.source, one.confidence)
 
 
 class _Layer(_Wires):
     """Outer layer of a dual-layer device."""
 
-    beyond_mm: Annotated[float, Field(ge=0, le=LARGEST_MM)]
+    beyond_mm: _Number[_Length_mm]
     """Length by which it is longer than the mesh at each end, at the label diameter, in mm."""
-    beyond_low_mm: Annotated[float, Field(ge=0, le=LARGEST_MM)] | None = None
-    beyond_high_mm: Annotated[float, Field(ge=0, le=LARGEST_MM)] | None = None
-    beyond_source: Annotated[str, Field(min_length=3)] | None = None
-    beyond_confidence: Confidence | None = None
-
-    @model_validator(mode="after")
-    def _check_beyond(self) -> "_Layer":
-        """Return the entry, or raise a ValueError if the range of the length is invalid."""
-        self._check_range(self.beyond_mm, (self.beyond_low_mm, self.beyond_high_mm))
-        _check_pair("beyond", self.beyond_source, self.beyond_confidence)
-        return self
-
-    def ranges(self, name: str) -> Iterator[Range]:
-        """Yield the stated ranges of count, diameter and length of the layer."""
-        yield from super().ranges(name)
-        ends_mm = self.beyond_low_mm, self.beyond_high_mm
-        yield from self._range(f"{name}_beyond_mm", self.beyond_mm, ends_mm, self.beyond_confidence)
-
-    def sources(self, name: str, number: int = 0) -> Iterator[Fact]:
-        """Yield the sources of the layer, its diameter and its length."""
-        yield from super().sources(name, number)
-        if self.beyond_source is not None and self.beyond_confidence is not None:
-            yield Fact(f"{name}_beyond_mm", self.beyond_source, self.beyond_confidence)
 
 
 class _Flag(_Sourced):
@@ -204,8 +135,10 @@ class _FreeProfile(_Sourced):
 
     wider_mm: list[Annotated[float, Field(ge=-5, le=5)]] = Field(min_length=2, max_length=MOST_SIZES)
     """How much wider than the body the free device is at the places, in mm; linear between them."""
-    wider_tolerance_mm: Annotated[float, Field(ge=0, le=5)] | None = None
+    wider_tolerance_mm: Annotated[float, Field(ge=0, le=5)]
     """Largest difference of these numbers to either side, in mm."""
+    reason: _Words
+    """Tolerance or class from which it follows."""
     from_ends_mm: list[Annotated[float, Field(ge=0, le=LARGEST_MM)]] | None = None
     """Distances from either end that the numbers refer to, in mm, for a device with flared ends."""
     fractions: list[Annotated[float, Field(ge=0, le=1)]] | None = None
@@ -219,18 +152,7 @@ class _FreeProfile(_Sourced):
             raise ValueError("give the places of wider_mm, either as from_ends_mm or as fractions")
         if len(places) != len(self.wider_mm) or any(b <= a for a, b in pairwise(places)):
             raise ValueError("give as many increasing places as there are numbers in wider_mm")
-        self._check_range(0.0, self._ends_mm)
         return self
-
-    @property
-    def _ends_mm(self) -> tuple[float | None, float | None]:
-        """Ends of the range of `wider_mm` around its values, in mm."""
-        by_mm = self.wider_tolerance_mm
-        return (None, None) if by_mm is None else (-by_mm, by_mm)
-
-    def ranges(self, name: str) -> Iterator[Range]:
-        """Yield the range of `wider_mm` around its values, if it is stated."""
-        yield from self._range(name, 0.0, self._ends_mm)
 
     def along(self, free_mm: float, length_mm: float) -> tuple[tuple[float, float], ...]:
         """Return pairs of a fraction of the length and the free diameter there, in mm."""
@@ -246,24 +168,10 @@ class _Sizes(_Sourced):
 
     diameters_mm: _Lengths_mm
     lengths_mm: _Lengths_mm
-    length_tolerance_mm: Annotated[float, Field(ge=0, le=LARGEST_MM)] | None = None
+    length_tolerance_mm: _Length_mm
     """Largest difference to either side between the label length and the length at the label diameter, in mm."""
-
-    @model_validator(mode="after")
-    def _check(self) -> "_Sizes":
-        """Return the entry, or raise a ValueError if its tolerance has no reason."""
-        self._check_range(0.0, self._ends_mm)
-        return self
-
-    @property
-    def _ends_mm(self) -> tuple[float | None, float | None]:
-        """Ends of the range of the label length around its value, in mm."""
-        by_mm = self.length_tolerance_mm
-        return (None, None) if by_mm is None else (-by_mm, by_mm)
-
-    def ranges(self) -> Iterator[Range]:
-        """Yield the range of the label length around its value, if it is stated."""
-        yield from self._range("label_length_mm", 0.0, self._ends_mm)
+    reason: _Words
+    """Tolerance or class from which it follows."""
 
 
 class _Device(_Strict):
@@ -272,7 +180,7 @@ class _Device(_Strict):
     key: str = Field(pattern=r"^[a-z0-9_]+$")
     name: str
     maker: str
-    free_diameter_margin_mm: _Margin
+    free_diameter_margin_mm: _Stated[_Margin_mm]
     """Free diameter minus label diameter, in mm."""
     sizes: list[_Sizes] = Field(min_length=1)
     free_profile: _FreeProfile | None = None
@@ -295,16 +203,20 @@ class _Device(_Strict):
 
     def _shared_ranges(self) -> tuple[Range, ...]:
         """Return the ranges of the numbers that both families have; of blocks of sizes the widest."""
-        lengths = [one for block in self.sizes for one in block.ranges()]
-        widest = sorted(lengths, key=lambda one: one.high)[-1:]
-        flare = tuple(self.free_profile.ranges("free_profile")) if self.free_profile else ()
-        return (*self.free_diameter_margin_mm.ranges("free_diameter_margin_mm"), *widest, *flare)
+        widest = sorted(self.sizes, key=lambda block: block.length_tolerance_mm)[-1]
+        found = [
+            _range(MARGIN, self.free_diameter_margin_mm),
+            _about_zero(LENGTH, widest.length_tolerance_mm, widest),
+        ]
+        if self.free_profile:
+            found.append(_about_zero(PROFILE, self.free_profile.wider_tolerance_mm, self.free_profile))
+        return tuple(found)
 
     def _shared_facts(self) -> tuple[Fact, ...]:
         """Return the sources of the numbers that both families have; blocks of sizes of one source have one fact."""
         blocks = {(block.source, block.confidence): block for block in self.sizes}
         return (
-            _fact("free_diameter_margin_mm", self.free_diameter_margin_mm),
+            _fact(MARGIN, self.free_diameter_margin_mm),
             *(_fact("sizes", block) for block in blocks.values()),
             *([_fact("free_profile", self.free_profile)] if self.free_profile else []),
         )
@@ -315,7 +227,7 @@ class _Braid(_Device):
 
     kind: Literal["braid"]
     wires: list[_Wires] = Field(min_length=1)
-    braid_angle_rad: _Number
+    braid_angle_rad: _Stated[_Positive]
     outer_layer: _Layer | None = None
     """Few thick wires around the mesh, longer than it."""
     strands: list[_Wires] = Field(default=[], max_length=MOST_SIZES)
@@ -328,7 +240,7 @@ class _Braid(_Device):
         return Braid(
             key=self.key,
             name=self.name,
-            wires=tuple((group.count, group.diameter_um) for group in self.wires),
+            wires=tuple((group.count.value, group.diameter_um.value) for group in self.wires),
             braid_angle_rad=self.braid_angle_rad.value,
             sizes=self._sizes(),
             maker=self.maker,
@@ -340,36 +252,36 @@ class _Braid(_Device):
 
     def _beyond_mm(self) -> float:
         """Return the length of both ends of the device that the label does not count, in mm."""
-        return 2 * self.outer_layer.beyond_mm if self.outer_layer else 0.0
+        return 2 * self.outer_layer.beyond_mm.value if self.outer_layer else 0.0
 
     def _facts(self) -> Iterator[Fact]:
         """Yield the sources of the numbers that only braids have."""
         for number, group in enumerate(self.wires):
-            yield from group.sources("wires", number)
+            yield from group.facts("wires", number)
         yield _fact("braid_angle_rad", self.braid_angle_rad)
         if self.outer_layer is not None:
-            yield from self.outer_layer.sources("outer_layer")
+            yield from self.outer_layer.facts("outer_layer")
         for number, group in enumerate(self.strands):
-            yield from group.sources("strands", number)
+            yield from group.facts("strands", number)
         if self.closed_ends is not None:
             yield _fact("closed_ends", self.closed_ends)
 
     def _strands(self) -> tuple[Strands, ...]:
         """Return the further wires of the braid."""
-        beside = tuple(Strands(group.count, group.diameter_um, "beside") for group in self.strands)
+        beside = tuple(Strands(group.count.value, group.diameter_um.value, "beside") for group in self.strands)
         if self.outer_layer is None:
             return beside
         layer = self.outer_layer
-        return (*beside, Strands(layer.count, layer.diameter_um, "outside", layer.beyond_mm))
+        return (*beside, Strands(layer.count.value, layer.diameter_um.value, "outside", layer.beyond_mm.value))
 
     def _ranges(self) -> tuple[Range, ...]:
         """Return the ranges of all numbers."""
         layer = [] if self.outer_layer is None else self.outer_layer.ranges("outer_layer")
         return (
-            *(one for number, group in enumerate(self.wires) for one in group.ranges(_nth("wire", number))),
-            *self.braid_angle_rad.ranges("braid_angle_rad"),
+            *(one for number, group in enumerate(self.wires) for one in group.ranges(nth("wire", number))),
+            _range("braid_angle_rad", self.braid_angle_rad),
             *layer,
-            *(one for number, group in enumerate(self.strands) for one in group.ranges(_nth("strand", number))),
+            *(one for number, group in enumerate(self.strands) for one in group.ranges(nth("strand", number))),
             *self._shared_ranges(),
         )
 
@@ -378,13 +290,13 @@ class _LaserCut(_Device):
     """Entry of a laser-cut device."""
 
     kind: Literal["laser_cut"]
-    n_columns: _Count
-    strut_width_um: _Width
-    strut_thickness_um: _Width
-    cell_angle_rad: _Number
+    n_columns: _Stated[_Whole]
+    strut_width_um: _Stated[_Width_um]
+    strut_thickness_um: _Stated[_Width_um]
+    cell_angle_rad: _Stated[_Positive]
     joined_crowns: _Crowns | None = None
     """Which crowns are joined, for a device with open cells."""
-    crown_gap_um: _Width | None = None
+    crown_gap_um: _Stated[_Width_um] | None = None
     """Distance between free crowns that face each other, in um."""
 
     @model_validator(mode="after")
@@ -409,7 +321,10 @@ class _LaserCut(_Device):
             sizes=self._sizes(),
             maker=self.maker,
             facts=tuple(_fact(name, getattr(self, name)) for name in words) + self._shared_facts(),
-            ranges=tuple(one for name in numbers for one in getattr(self, name).ranges(name)) + self._shared_ranges(),
+            ranges=(
+                *(_range(name, getattr(self, name)) for name in numbers),
+                *self._shared_ranges(),
+            ),
             joined_crowns=tuple(self.joined_crowns.value) if self.joined_crowns else (),
             crown_gap_um=self.crown_gap_um.value if self.crown_gap_um else 0.0,
         )
@@ -421,20 +336,24 @@ class _Catalogue(_Strict):
     device: list[Annotated[_Braid | _LaserCut, Field(discriminator="kind")]]
 
 
-def _fact(name: str, sourced: _Sourced) -> Fact:
+def _fact(name: str, sourced: _Sourced | _Stated[int] | _Stated[float]) -> Fact:
     """Return the source of one number."""
     return Fact(name, sourced.source, sourced.confidence)
 
 
-def _check_pair(name: str, source: str | None, confidence: Confidence | None) -> None:
-    """Raise a ValueError if only one of source and confidence of a number is given."""
-    if (source is None) != (confidence is None):
-        raise ValueError(f"{name}_source and {name}_confidence go together")
+def _range(name: str, number: _Number[int] | _Number[float], group: _Wires | None = None) -> Range:
+    """Return the range of a number, with its own reason and confidence or those of its group."""
+    reason, confidence = number.reason, number.confidence
+    if group is not None:
+        reason, confidence = reason or group.reason, confidence or group.confidence
+    assert reason is not None
+    assert confidence is not None
+    return Range(name, number.value, number.low, number.high, reason, confidence)
 
 
-def _nth(name: str, number: int) -> str:
-    """Return the name of a group of wires, counted from 0: wire, wire_2 and so on."""
-    return f"{name}_{number + 1}" if number else name
+def _about_zero(name: str, tolerance: float, group: _Sizes | _FreeProfile) -> Range:
+    """Return the range of a difference from values of the catalogue."""
+    return Range(name, 0.0, -tolerance, tolerance, group.reason, group.confidence)
 
 
 def parse(text: str, name: str = "The device catalogue") -> dict[str, Design]:
