@@ -168,7 +168,7 @@ class _Writer:
                 "reason": f"difference from the label, and {REASON}",
             }
             tolerance_mm = round(abs(value) + ERRORS * error, 2)
-            block = {"diameters_mm": [diameter_mm], "lengths_mm": [length_mm], "length_tolerance_mm": tolerance_mm}
+            block: dict[str, Any] = {"diameters_mm": [diameter_mm], "lengths_mm": [length_mm], "length_tolerance_mm": tolerance_mm}
             found.append(block | told)
         for diameter_mm in sorted({size.diameter_mm for size in self.like.sizes}) if has_all else ():
             lengths_mm = sorted(one.length_mm for one in self.like.sizes if one.diameter_mm == diameter_mm)
