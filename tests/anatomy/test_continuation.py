@@ -64,10 +64,8 @@ def test_a_straight_artery_is_continued_along_itself(whole: Anatomy) -> None:
 
 def test_an_oval_section_relaxes_to_the_circle_of_its_area(whole: Anatomy) -> None:
     """After RELAXING_DIAMETERS diameters 1/e of the difference from the circle is left."""
-    short = cut(whole, 6.0)
     rings_mm = whole.parent.landing_surface.vertices_mm.copy() * [1.15, 1 / 1.15, 1.0]
     surface = replace(whole.parent.landing_surface, vertices_mm=rings_mm)
-    first_mm, _ = neck_span_mm(whole)
     points_mm = whole.parent.axis.at(np.linspace(4.0, neck_span_mm(whole)[1], 9))
     sac = replace(whole.aneurysms[0], neck_mm=points_mm)
     oval = continued(replace(on_parent(whole, landing_surface=surface), aneurysms=(sac,)))
@@ -81,8 +79,6 @@ def test_an_oval_section_relaxes_to_the_circle_of_its_area(whole: Anatomy) -> No
     from_end_mm = added_mm - oval.parent.axis.abscissa_mm[new]
     expected = radius_mm + np.exp(-from_end_mm / (2 * radius_mm * RELAXING_DIAMETERS))[:, None] * (at_end - radius_mm)
     np.testing.assert_allclose(rho_mm[new], expected, rtol=1e-6)
-    assert first_mm > ENOUGH_MM > 0
-    assert short.parent.landing_surface.faces.max() == len(short.parent.landing_surface.vertices_mm) - 1
 
 
 def test_what_lies_in_the_continuation_counts_in_no_measure_of_the_wall(whole: Anatomy) -> None:

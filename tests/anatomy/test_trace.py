@@ -340,7 +340,6 @@ def test_a_lens_of_two_flat_sides_is_no_vessel() -> None:
 
 
 def test_a_branch_too_narrow_on_its_way_is_not_taken_for_a_blind_one() -> None:
-    """It used to be cut open before its narrow part, and its own end with it."""
     direction = np.array([1.0, 0.0, 1.2])
     trunk = phantoms.tube(length_mm=28.0)
     branched = phantoms.with_branch(trunk, abscissa_mm=8.0, direction=direction, radius_mm=0.6, length_mm=22.0)

@@ -1,6 +1,5 @@
 """The paper's method beside the default one; devices pushed, one in another, and in a branch."""
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -46,9 +45,8 @@ def wavy():
     middle_mm = np.repeat(artery.parent.axis.points_mm, 160, axis=0)
     angle = np.tile(2 * np.pi * np.arange(160) / 160, len(artery.parent.axis.points_mm))
     growth = 1 + 0.12 * (1 + np.cos(3 * angle))
-    return replace(
-        artery, landing_surface=Surface(middle_mm + growth[:, None] * (vertices_mm - middle_mm), surface.faces)
-    )
+    grown_mm = middle_mm + growth[:, None] * (vertices_mm - middle_mm)
+    return on_parent(artery, landing_surface=Surface(grown_mm, surface.faces))
 
 
 SLOW = ActiveContour(k1=0.3)
@@ -116,7 +114,7 @@ def test_both_methods_lie_on_the_same_wall_and_differ_in_length_and_coverage():
     reach = (ours.stent.row_abscissa_mm > 11.0) & (ours.stent.row_abscissa_mm < 25.0)
     assert inner.closest(ours.stent.nodes_mm[reach].reshape(-1, 3))[1].max() < 0.06
     assert a["deployed_length_mm"] == pytest.approx(15.0)
-    assert b["deployed_length_mm"] < 0.95 * a["deployed_length_mm"] or b["deployed_length_mm"] > 15.5
+    assert b["deployed_length_mm"] == pytest.approx(12.3, abs=0.1)
     assert abs(b["mean_wire_stretch_fraction"]) < 0.01 < abs(a["mean_wire_stretch_fraction"])
 
 

@@ -87,9 +87,10 @@ def test_the_outer_layer_is_longer_than_the_mesh_at_both_ends_and_lies_between_i
     assert radius_mm[is_outer].max() + 0.03 == pytest.approx(RADIUS_MM, abs=2e-3)
     first, last = mesh_rows(DUAL, size)
     spacing_mm = float(row_spacing_mm(DUAL, size, 2 * (RADIUS_MM - 0.15)))
-    for inner, outer, rows in ((along_mm[~is_outer].min(), along_mm[is_outer].min(), first),):
-        assert inner - outer == pytest.approx(rows * spacing_mm, rel=1e-3)
-    assert grid(DUAL, size).lattice_rows - 1 - last == first == round(2.5 / float(row_spacing_mm(DUAL, size, 4.0)))
+    beyond = grid(DUAL, size).lattice_rows - 1 - last
+    assert along_mm[~is_outer].min() - along_mm[is_outer].min() == pytest.approx(first * spacing_mm, rel=1e-3)
+    assert along_mm[is_outer].max() - along_mm[~is_outer].max() == pytest.approx(beyond * spacing_mm, rel=1e-3)
+    assert beyond == first == round(2.5 / float(row_spacing_mm(DUAL, size, 4.0)))
     assert np.diff(stent.mesh_abscissa_mm) == pytest.approx((last - first) * spacing_mm, rel=1e-3)
 
 

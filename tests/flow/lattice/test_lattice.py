@@ -1,6 +1,7 @@
 """The lattice-Boltzmann kernels against their algebra, and the grid and field kernels against geometry."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -71,6 +72,12 @@ def test_a_segment_of_any_length_collides_as_its_cells_do_alone_and_no_other_is_
     np.testing.assert_array_equal(together, alone)
 
 
+@cache
+def bend():
+    arc = phantoms.torus_arc(bend_radius_mm=5.0, angle_rad=1.0, radius_mm=2.0)
+    return vessel_case(trace(Vessel(phantoms.phantom_surface(arc, edge_mm=0.5))), FlowSettings(inflow_mL_s=3.0))
+
+
 def with_septa(domain, rng):
     """Put walls half-way between every tenth pair or so of neighbouring cells."""
     is_blood = np.zeros(domain.cells.max(axis=0) + 2, bool)
@@ -86,8 +93,7 @@ def test_a_band_is_done_when_all_that_it_needs_is(threads):
 
     A bend has links of all kinds; walls half-way between its cells are put in.
     """
-    arc = phantoms.torus_arc(bend_radius_mm=5.0, angle_rad=1.0, radius_mm=2.0)
-    case = vessel_case(trace(Vessel(phantoms.phantom_surface(arc, edge_mm=0.5))), FlowSettings(inflow_mL_s=3.0))
+    case = bend()
     state = LatticeBoltzmann(0.3).init(case, None)
     rng = np.random.default_rng(5)
     state.populations[:] = 0.01 * rng.normal(size=state.populations.size)
@@ -137,14 +143,9 @@ def test_speeds_are_those_of_numpys_norm():
     np.testing.assert_array_equal(found, np.linalg.norm(velocity, axis=1))
 
 
-def test_whole_vectors_reach_into_no_other_layer():
-    """Beyond a segment they write again what they have read there, while another thread may be at the next layer."""
-
-
-def test_layers_share_no_line_of_the_cache():
-    arc = phantoms.torus_arc(bend_radius_mm=5.0, angle_rad=1.0, radius_mm=2.0)
-    case = vessel_case(trace(Vessel(phantoms.phantom_surface(arc, edge_mm=0.5))), FlowSettings(inflow_mL_s=3.0))
-    state = LatticeBoltzmann(0.3).init(case, None)
+def test_layers_share_no_line_of_the_cache_and_no_vector_reaches_into_another():
+    """Beyond a segment vectors write again what they have read, while another thread may be at the next layer."""
+    state = LatticeBoltzmann(0.3).init(bend(), None)
     domain, a = state.domain, state.addressing
     beyond = domain.cells[domain.link_cell] + directions.VELOCITIES[domain.link_direction]
     layer = np.concatenate([domain.cells[:, 0], beyond[:, 0]])

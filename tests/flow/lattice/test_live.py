@@ -72,12 +72,13 @@ def settled(live: LiveFlow) -> tuple[float, float]:
         now = live.read()
         found = np.array([now.neck_inflow_mL_s, now.sac_velocity_m_s])
         if np.abs(found / np.maximum(before, 1e-12) - 1).max() < 1e-3:
-            break
+            return float(found[0]), float(found[1])
         before = found
         live.advance(1.0)
-    return float(found[0]), float(found[1])
+    pytest.fail(f"after a minute the flow still changes from {before} to {found}")
 
 
+@cache
 def alone(live: LiveFlow, one: tuple[Sheet, ...]) -> tuple[float, float]:
     """Return neck inflow and sac velocity of a run of its own, in the same coarse flow."""
     engine = LatticeBoltzmann(live.cell_size_mm, None, live.outer)
@@ -95,7 +96,7 @@ def test_the_flow_without_a_device_is_that_of_a_run(live: LiveFlow) -> None:
 
 def test_an_exchanged_device_comes_to_its_own_flow(live: LiveFlow) -> None:
     dense, sparse = devices()
-    for one in (sparse, dense, None, dense):
+    for one in (sparse, dense, (), dense):
         live.place(one)
         np.testing.assert_allclose(settled(live), alone(live, one), rtol=0.03)
 
