@@ -35,6 +35,8 @@ STUMP_SLENDERNESS: Final = 2.5
 ends."""
 ARM_SWELLING: Final = 1.35
 """An arm is a sac on a stalk if its widest sphere near the tip exceeds its median radius by this factor."""
+ARM_WIDENING: Final = 1.6
+"""An arm is a sac with a lobe if it widens by this factor beyond a narrow place, towards its tip."""
 ARM_SHARE: Final = 0.15
 """Largest fraction of the wall that opening an arm removes: its tip with the small branches on it."""
 ARM_RADIUS_MM: Final = 0.5
@@ -305,7 +307,8 @@ def _cut_of(points_mm: Floats, radius_mm: Floats, slenderness: float) -> tuple[F
     body = outside & (radius_mm > 0.75 * typical)
     length = abscissa[body][-1] - abscissa[body][0]
     outer = body & (abscissa > abscissa[body][0] + 0.5 * length)
-    if length < slenderness * typical or radius_mm[outer].max() > ARM_SWELLING * typical:
+    widening = (radius_mm[outside] / np.minimum.accumulate(radius_mm[outside])).max()
+    if length < slenderness * typical or radius_mm[outer].max() > ARM_SWELLING * typical or widening > ARM_WIDENING:
         return None
     end = float(abscissa[body][-1]) - typical
     center, behind = curves.interpolate(abscissa, points_mm, np.array([end, end - 2 * typical]))
