@@ -5,7 +5,7 @@ from rich.table import Table
 
 from vstent.cli.console import _state, comparison_table, flow_table, opening_table
 from vstent.geometry.vessel import Opening
-from vstent.study.types import Progress
+from vstent.study.progress import Progress
 
 BARE = {"neck_inflow_mL_s": 6.861, "mean_sac_velocity_m_s": 0.4049, "turnover_time_s": 0.0571}
 AFTER = {"neck_inflow_mL_s": 4.453, "mean_sac_velocity_m_s": 0.2381, "turnover_time_s": 0.0880}

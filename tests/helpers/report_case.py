@@ -198,6 +198,7 @@ def case(name="Bent tube with a sac"):
             "seconds": {"trace": 1.25, "deploy": 0.83},
         },
         notes=("Units were guessed as mm from the size of the artery.",),
+        keys={},
         whole=None,
     )
 

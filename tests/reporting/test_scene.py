@@ -48,7 +48,7 @@ def test_the_side_that_hides_less_is_chosen():
     free = report_case.scene().view("profile").axes[2]
     screen = report_case.sphere(12.0 * free + [0, 0, 9.0], 5.0)
     vessel = SimpleNamespace(lumen=report_case.joined(case.anatomy.vessel.lumen, screen))
-    hidden = SimpleNamespace(vessel=vessel, axis=case.anatomy.parent.axis, aneurysms=case.anatomy.aneurysms)
+    hidden = SimpleNamespace(vessel=vessel, parent=case.anatomy.parent, aneurysms=case.anatomy.aneurysms)
     chosen = views_of(hidden, [one for found in case.implants.values() for one in found.values()])[0].axes
     assert chosen[2] == pytest.approx(-free)
     assert np.linalg.det(chosen) == pytest.approx(1)  # turned round, not mirrored
