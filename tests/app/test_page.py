@@ -296,7 +296,9 @@ def test_deployed_numbers_are_those_of_the_measures(client, case, workspace):
 def test_the_section_has_the_phantoms_radius(client, case):
     start, _ = app_case.opened(client.post(f"{case}/sketch", json=wanted(SILK)))
     place = start["ends_mm"][0] + 1.0
-    section = client.get(f"{case}/section", params={"abscissa_mm": place, "treatment": "silk", "implant": "silk"}).json()
+    section = client.get(
+        f"{case}/section", params={"abscissa_mm": place, "treatment": "silk", "implant": "silk"}
+    ).json()
     segments = np.array(section["landing"]).reshape(-1, 2, 2)
     near = np.linalg.norm(segments, axis=2).max(axis=1) < section["artery_diameter_mm"]
     length = np.linalg.norm(segments[near, 1] - segments[near, 0], axis=1).sum()
@@ -517,7 +519,9 @@ def test_what_cannot_be_chosen_on_the_page_stays_as_the_study_had_it(flown, tmp_
     with app_case.served(tmp_path / "cases", folder) as client:
         case = f"/api/cases/{client.get('/api/cases').json()['opened']}"
         view = client.get(case).json()
-        assert {"flow blood viscosity_Pa_s 0.0035", "flow blood thinning", "flow numerics close_up True"} < set(view["unseen"])
+        assert {"flow blood viscosity_Pa_s 0.0035", "flow blood thinning", "flow numerics close_up True"} < set(
+            view["unseen"]
+        )
         assert client.get("/api/waveform", params={"case_id": case.rpartition("/")[2]}).json()["time_s"][-1] == 0.8
         choose(client, case, flow=view["choices"]["flow"] | {"inflow_mL_s": 2.0}, treatments=[alone("enterprise")])
         asked = load("flown", folder).state.settings()

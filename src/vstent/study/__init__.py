@@ -3,4 +3,3 @@
 Open ``pipeline.py`` first; ``stages.py`` holds the stages in their order, ``store.py`` keeps their results under the
 keys of ``keys.py``.
 """
-

@@ -29,6 +29,7 @@ ANATOMY: Final = "anatomy"
 VESSEL: Final = "vessel"
 """Name of the vessel before it is trimmed in the store."""
 
+
 def key_of(entry: str, *parts: Any, without: tuple[str, ...] = ()) -> Key:
     """Return the key of a result.
 

@@ -203,9 +203,7 @@ def deploy_all(
     return found, failures
 
 
-def _deployed(
-    treatment: Treatment, anatomy: Anatomy, store: Store, keys: Mapping[str, Key]
-) -> dict[str, Deployment]:
+def _deployed(treatment: Treatment, anatomy: Anatomy, store: Store, keys: Mapping[str, Key]) -> dict[str, Deployment]:
     """Return the deployed implants of a treatment by id, each stored or computed."""
     found: dict[str, Deployment] = {}
     for implant in treatment.implants:

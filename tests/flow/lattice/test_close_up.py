@@ -369,8 +369,8 @@ def test_a_refined_sac_starts_from_a_similar_flow_if_that_is_steady(monkeypatch:
     case, outer = outer_of_demo()
     wanted = replace(case, numerics=replace(case.numerics, close_up=True))
     begun: list[FlowField] = []
-    monkeypatch.setattr(flow._Runs, "_coarse", lambda *_: outer)
-    monkeypatch.setattr(flow._Runs, "_run", lambda _, __, ___, guess, *____: begun.append(guess()))
+    monkeypatch.setattr(flow._Runs, "_from_coarser", lambda *_: outer)
+    monkeypatch.setattr(flow._Runs, "_run", lambda _, __, ___, ____, guess, *_____: begun.append(guess()))
     steady = with_values(outer, velocity_m_s=0.5 * outer.velocity_m_s)
     swinging = replace(steady, mean_shear_Pa=np.zeros(len(outer.wall.vertices_mm)))
     for similar in (None, steady, swinging):
