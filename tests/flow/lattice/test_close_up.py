@@ -102,9 +102,8 @@ def test_what_surrounds_a_close_up_is_given_half_of_the_steps_and_no_neck_to_wat
 
     monkeypatch.setattr(flow, "run", telling)
     sac = ball((0.0, 0.0, 24.0))
-    case = vessel_case(tube(line(40.0), RADIUS_MM).vessel, target=Target(sac, sac))
     settings = FlowSettings(inflow_mL_s=INFLOW_ML_S, numerics=Numerics(cell_size_mm=0.3, close_up=True, max_steps=960))
-    simulate_case(replace(case, settings=settings))
+    simulate_case(vessel_case(tube(line(40.0), RADIUS_MM).vessel, settings, target=Target(sac, sac)))
     assert seen == [(0.6, 480, None), (0.3, 960, sac)]
 
 
