@@ -1,6 +1,6 @@
 """Flow computation: `simulate` an anatomy with and without devices, or `simulate_case` for a single flow."""
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -41,6 +41,8 @@ OnProgress = Callable[[Progress], None]
 """Callback that receives the progress."""
 Guess = Callable[[], FlowField | None]
 """Function that returns a first guess, or None."""
+Part = tuple[float, float] | None
+"""Begin and end of a run as fractions of a whole flow; None: its progress is not reported."""
 
 
 class Checkpoint(Protocol):
@@ -232,96 +234,66 @@ class _Runs:
     """Flow with a similar stent, from which the whole vessel starts."""
 
     def answer(self, case: FlowCase, start: FlowField | None) -> FlowField:
-        """Compute a flow, from a coarse-grid guess unless a saved run is resumed or the coarse grid is too coarse."""
-        cell_size_mm = default_cell_size_mm(case)
-        if case.numerics.close_up:
-            return self._close_up(case, start, cell_size_mm)
-        runs = 0 if self.similar is not None else _coarse_runs(self.engine, case, start)
-        progress = self._part(runs * COARSE_SHARE, 1.0)
-        engine = self.engine(cell_size_mm, self.folder)
-        return self._run(
-            engine, case, lambda: self._guess(case, start, cell_size_mm), progress, self._bookmark("answer")
-        )
-
-    def _close_up(self, case: FlowCase, start: FlowField | None, cell_size_mm: float) -> FlowField:
-        """Compute the whole vessel on a coarse grid, then the sac and its neck on a fine grid inside it."""
+        """Compute a flow; of a refined sac first that of the whole vessel on a coarse grid."""
+        size_mm = default_cell_size_mm(case)
+        if not case.numerics.close_up:
+            return self._from_coarser(case, size_mm, start, "answer")
         target = Target(require_sac(case), None)
         steps = int(SHARE_AROUND * case.numerics.max_steps)
         # Without the ostium: oscillations at the neck would need most of the steps, and the fine grid recomputes them.
         around = replace(case, target=target, numerics=replace(case.numerics, max_steps=steps))
-        outer = self._coarse(around, WIDTH * cell_size_mm, start, "outer", self._part(0.0, OUTER_SHARE))
+        first = replace(self, progress=self._part(0.0, OUTER_SHARE))
+        outer = first._from_coarser(around, WIDTH * size_mm, start, "outer")
         # The mean of an unsteady flow lacks its oscillations: from it C0038's averages take longer than from `outer`.
         guess = outer if self.similar is None or self.similar.mean_shear_Pa is not None else self.similar
-        engine = self.engine(cell_size_mm, self.folder, outer)
-        return self._run(engine, case, lambda: guess, self._part(OUTER_SHARE, 1.0), self._bookmark("answer"))
+        return self._run("answer", case, size_mm, lambda: guess, (OUTER_SHARE, 1.0), outer)
 
-    def _guess(self, case: FlowCase, start: FlowField | None, cell_size_mm: float, depth: int = 0) -> FlowField | None:
-        """Return a first guess for a grid from coarser ones, or `start` if the next one is too coarse or diverges.
+    def _from_coarser(self, case: FlowCase, size_mm: float, start: FlowField | None, name: str) -> FlowField:
+        """Compute a flow from a first guess on coarser grids, each of which starts from the next coarser one.
 
-        If the flow without a device is known, the coarse grid only provides the change due to the screen (the
-        correction scheme of multigrid, Brandt 1977, Math. Comput. 31, 333). The difference between the grids in the
-        flow without a device is scaled by the ratio of speeds with and without the screen; otherwise it would exceed
-        the flow itself in a sac nearly at rest.
+        Every run is begun only where a finer one needs its result; a finer one that is resumed does not. If the flow
+        without a device is known, a coarse grid only provides the change due to the screen (see `_guess`).
         """
-        if self.similar is not None:
-            return self.similar
-        if self.engine.coarsening is None:
-            return start
-        coarse_mm = self.engine.coarsening * cell_size_mm
-        is_tiny = abs(case.vessel.closed.volume_mm3) < 4 * MIN_CELLS * coarse_mm**3
-        if is_tiny or (start is not None and not case.media):
-            return start
-        first, second = (
-            self._part(rank * COARSE_SHARE, (rank + 1) * COARSE_SHARE) if depth == 0 else None for rank in range(2)
-        )
-        with suppress(DivergenceError, CoarseGridError):
-            if start is None:
-                return self._coarse(case, coarse_mm, None, "guess", first, depth)
-            bare = self._bare_guess(case, start, coarse_mm, first, depth)
-            return _corrected(
-                sampling.uniform(start), bare, self._coarse(case, coarse_mm, bare, "stented guess", second, depth)
-            )
-        return start
+        start = start if self.similar is None else self.similar
+        sizes_mm = [size_mm, *self._coarser_mm(case, size_mm, start)]
+        share, runs = COARSE_SHARE, 0 if len(sizes_mm) == 1 else 1 if start is None else 2
+        bare: list[Guess] = [lambda: start]
+        for depth, coarse_mm in enumerate(sizes_mm[1:], start=1):
+            part = (0.0, share) if depth == 1 else None
+            bare.append(cache(partial(self._bare, f"bare {depth}", case, coarse_mm, bare[-1], part)))
+        found = bare[-1]
+        for depth in range(len(sizes_mm) - 1, 0, -1):
+            part = ((runs - 1) * share, runs * share) if depth == 1 else None
+            run_ = partial(self._run, f"guess {depth}", case, sizes_mm[depth], found, part)
+            found = cache(partial(_guess, bare[depth - 1], bare[depth], run_))
+        return self._run(name, case, size_mm, found, (runs * share, 1.0))
 
-    def _bare_guess(
-        self, case: FlowCase, start: FlowField, coarse_mm: float, progress: OnProgress | None, depth: int
-    ) -> FlowField:
-        """Return the coarse-grid flow without a device, started from the fine one and computed only once."""
-        done, key = (
-            _BARE_GUESSES.setdefault(start, {}),
-            (coarse_mm, case.ends, case.blood, case.waveform, case.numerics),
-        )
+    def _coarser_mm(self, case: FlowCase, size_mm: float, start: FlowField | None) -> Iterator[float]:
+        """Yield the spacings of the grids that provide first guesses, fine to coarse."""
+        coarsening, volume_mm3 = self.engine.coarsening, abs(case.vessel.closed.volume_mm3)
+        if coarsening is None or self.similar is not None or (start is not None and not case.media):
+            return
+        while volume_mm3 >= 4 * MIN_CELLS * (coarsening * size_mm) ** 3:
+            yield (size_mm := coarsening * size_mm)
+
+    def _bare(self, name: str, case: FlowCase, size_mm: float, finer: Guess, part: Part) -> FlowField | None:
+        """Return the flow without a device on a coarse grid, from a finer one and computed only once; None without."""
+        start = finer()
+        if start is None:
+            return None
+        key = size_mm, case.ends, case.blood, case.waveform, case.numerics
+        done = _BARE_GUESSES.setdefault(start, {})
         if key not in done:
-            bare = replace(case, media=(), solids=())
-            done[key] = self._coarse(bare, coarse_mm, start, "bare guess", progress, depth)
+            done[key] = self._run(name, replace(case, media=(), solids=()), size_mm, finer, part)
         return done[key]
 
-    def _coarse(
-        self,
-        case: FlowCase,
-        cell_size_mm: float,
-        start: FlowField | None,
-        name: str,
-        progress: OnProgress | None,
-        depth: int = 0,
-    ) -> FlowField:
-        """Compute a flow on a coarser grid, itself from a guess; runs below the first level need negligible time."""
-        name = depth * "coarser " + name
-        engine = _engine_of(case)(cell_size_mm, self.folder / name)
-        return self._run(
-            engine, case, lambda: self._guess(case, start, cell_size_mm, depth + 1), progress, self._bookmark(name)
-        )
-
     def _run(
-        self,
-        engine: AbstractEngine[Any],
-        case: FlowCase,
-        guess: Guess,
-        progress: OnProgress | None,
-        bookmark: Bookmark | None,
+        self, name: str, case: FlowCase, size_mm: float, guess: Guess, part: Part, outer: FlowField | None = None
     ) -> FlowField:
         """Run an engine from a guess or a saved state; after divergence start again with the engine's calmer case."""
-        guess = cache(partial(_guessed, engine, case, guess))
+        engine = self.engine(size_mm, self.folder if name == "answer" else self.folder / name, outer)
+        guess, bookmark = cache(partial(_guessed, engine, case, guess)), self._bookmark(name)
+        progress = None if part is None else self._part(*part)
 
         def attempt() -> FlowField:
             found = None if bookmark is not None and bookmark.saved is not None else guess()
@@ -371,6 +343,21 @@ def _guessed(engine: AbstractEngine[Any], case: FlowCase, guess: Guess) -> FlowF
     return found
 
 
+def _guess(start: Guess, bare: Guess, stented: Callable[[], FlowField]) -> FlowField | None:
+    """Return a first guess from a coarser grid, or the start if that grid is too coarse or its flow diverges.
+
+    If the flow without a device is known, the coarse grid only provides the change due to the screen (the correction
+    scheme of multigrid, Brandt 1977, Math. Comput. 31, 333). The difference between the grids in the flow without a
+    device is scaled by the ratio of speeds with and without the screen; otherwise it would exceed the flow itself in a
+    sac nearly at rest.
+    """
+    fine = start()
+    with suppress(DivergenceError, CoarseGridError):
+        coarse = bare()
+        return stented() if fine is None or coarse is None else _corrected(sampling.uniform(fine), coarse, stented())
+    return fine
+
+
 def _corrected(start: FlowField, bare: FlowField, stented: FlowField) -> FlowField:
     """Return a bare flow plus the change due to a screen on a coarser grid; if pulsatile, mean and last phase."""
     fields = start, bare, stented
@@ -391,12 +378,3 @@ def _changed(start: FlowField, bare: FlowField, stented: FlowField) -> Level:
     velocity_m_s = after[0] + left * (grid.velocity_m_s - before[0])
     pressure_Pa = grid.pressure_Pa + after[1] - before[1]
     return replace(grid, velocity_m_s=velocity_m_s, pressure_Pa=pressure_Pa, mean_speed_m_s=None)
-
-
-def _coarse_runs(engine: type[AbstractEngine[Any]], case: FlowCase, start: FlowField | None) -> int:
-    """Return the number of coarse runs before the result."""
-    if engine.coarsening is None:
-        return 0
-    if start is None:
-        return 1
-    return 2 if case.media else 0

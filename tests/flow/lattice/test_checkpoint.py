@@ -92,7 +92,8 @@ def assert_same(a: FlowField, b: FlowField) -> None:
     np.testing.assert_array_equal(a.residual, b.residual)
     assert (a.steps, a.advice, len(a.phases)) == (b.steps, b.advice, len(b.phases))
     for one, other in zip(a.phases, b.phases, strict=True):
-        np.testing.assert_array_equal(one.velocity_m_s, other.velocity_m_s)
+        for first, second in zip(one.velocity_m_s, other.velocity_m_s, strict=True):
+            np.testing.assert_array_equal(first, second)
 
 
 KILLED = f"""

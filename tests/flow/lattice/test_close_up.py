@@ -102,9 +102,8 @@ def test_what_surrounds_a_close_up_is_given_half_of_the_steps_and_no_neck_to_wat
 
     monkeypatch.setattr(flow, "run", telling)
     sac = ball((0.0, 0.0, 24.0))
-    case = vessel_case(tube(line(40.0), RADIUS_MM).vessel, target=Target(sac, sac))
     settings = FlowSettings(inflow_mL_s=INFLOW_ML_S, numerics=Numerics(cell_size_mm=0.3, close_up=True, max_steps=960))
-    simulate_case(replace(case, settings=settings))
+    simulate_case(vessel_case(tube(line(40.0), RADIUS_MM).vessel, settings, target=Target(sac, sac)))
     assert seen == [(0.6, 480, None), (0.3, 960, sac)]
 
 
@@ -369,8 +368,8 @@ def test_a_refined_sac_starts_from_a_similar_flow_if_that_is_steady(monkeypatch:
     case, outer = outer_of_demo()
     wanted = replace(case, numerics=replace(case.numerics, close_up=True))
     begun: list[FlowField] = []
-    monkeypatch.setattr(flow._Runs, "_coarse", lambda *_: outer)
-    monkeypatch.setattr(flow._Runs, "_run", lambda _, __, ___, guess, *____: begun.append(guess()))
+    monkeypatch.setattr(flow._Runs, "_from_coarser", lambda *_: outer)
+    monkeypatch.setattr(flow._Runs, "_run", lambda _, __, ___, ____, guess, *_____: begun.append(guess()))
     steady = with_values(outer, velocity_m_s=0.5 * outer.velocity_m_s)
     swinging = replace(steady, mean_shear_Pa=np.zeros(len(outer.wall.vertices_mm)))
     for similar in (None, steady, swinging):

@@ -1,6 +1,7 @@
 """What a flow will cost is foretold, and why it failed is said."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -141,7 +142,7 @@ def test_a_guess_whose_grid_is_too_coarse_is_done_without(monkeypatch):
     monkeypatch.setattr("vstent.flow.simulation.MIN_CELLS", 500)
     with pytest.raises(domain.CoarseGridError):
         domain.build(vessel, 0.44)
-    assert simulate_case(case).cell_size_mm == 0.11
+    assert simulate_case(case).finest.cell_size_mm == 0.11
     assert tried == pytest.approx([0.44, 0.22, 0.11])
 
 
@@ -152,7 +153,7 @@ def test_what_diverges_after_it_was_resumed_begins_anew_from_the_guess(monkeypat
         tried.append((engine.cell_size_mm, case.numerics.lattice_speed, start))
         if len(tried) == 1:
             raise DivergenceError("too fast")
-        return f"cells of {engine.cell_size_mm} mm"
+        return SimpleNamespace(levels=(engine.cell_size_mm,))
 
     class Kept:
         def load(self, run):
@@ -162,9 +163,9 @@ def test_what_diverges_after_it_was_resumed_begins_anew_from_the_guess(monkeypat
             pass
 
     monkeypatch.setattr("vstent.flow.simulation.run", stub)
-    assert simulate_case(case, checkpoint=Kept()) == "cells of 0.1 mm"
+    assert simulate_case(case, checkpoint=Kept()).levels == (0.1,)
     speed = case.numerics.lattice_speed
-    assert tried == [(0.1, speed, None), (0.2, speed, None), (0.1, 0.5 * speed, "cells of 0.2 mm")]
+    assert tried == [(0.1, speed, None), (0.2, speed, None), (0.1, 0.5 * speed, SimpleNamespace(levels=(0.2,)))]
 
 
 def test_a_sac_smaller_than_a_cell_is_told_as_that():
