@@ -64,12 +64,14 @@ def test_the_command_line_as_a_module_skips_the_folder(trap, monkeypatch):
     assert (done.returncode, "does not exist" in done.stderr) == (2, True), done.stderr
 
 
-def test_a_script_without_a_main_guard_has_workers(tmp_path):
-    script = tmp_path / "plain.py"
-    script.write_text(
-        "import operator\nfrom vstent.plan.workers import spread\nprint(sum(spread(operator.mul, 3, [1, 2], jobs=2)))\n"
-    )
-    done = subprocess.run([sys.executable, str(script)], env=environment(), capture_output=True, text=True, check=True)
+PLAIN = "import operator\nfrom vstent.plan.workers import spread\nprint(sum(spread(operator.mul, 3, [1, 2], jobs=2)))\n"
+
+
+@pytest.mark.parametrize("is_piped", [False, True])
+def test_a_script_without_a_main_guard_has_workers(tmp_path, is_piped):
+    (tmp_path / "plain.py").write_text(PLAIN)
+    command = [sys.executable, "-" if is_piped else str(tmp_path / "plain.py")]
+    done = subprocess.run(command, env=environment(), input=PLAIN, capture_output=True, text=True, check=True)
     assert done.stdout == "9\n"
 
 
