@@ -12,6 +12,7 @@ from contextlib import suppress
 from typing import Any, Final
 
 from vstent.app.cases import Case, State, dependencies
+from vstent.children import environment
 
 KINDS: Final = {
     "anatomy": ("image", "vessel", "sac"),
@@ -76,6 +77,7 @@ class Job:
         with (case.folder / LAST_WORDS).open("w", encoding="utf-8") as last_words:
             self._process = subprocess.Popen(
                 command,
+                env=environment(),
                 stdin=subprocess.PIPE,  # it closes when the server ends for any reason, and the job ends then
                 stdout=subprocess.PIPE,
                 stderr=last_words,

@@ -17,6 +17,7 @@ from pathlib import Path
 from threading import Condition, Lock, Thread
 from typing import TYPE_CHECKING, Final
 
+from vstent.children import spawning
 from vstent.devices.stent import Stent
 from vstent.errors import InputError, VstentError
 from vstent.flow.case import FlowCase
@@ -173,7 +174,8 @@ class Preview:
         context = get_context("spawn")
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=work, args=(theirs, self.settings, self.shelf), daemon=True)
-        self._process.start()
+        with spawning():
+            self._process.start()
         theirs.close()
         self._post = _Post(self._pipe, self.anatomy)
         Thread(target=self._follow, args=(self._pipe,), daemon=True).start()

@@ -17,6 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from vstent.children import environment
 from vstent.errors import ReadError
 from vstent.geometry.image import Image
 from vstent.io.files import suffix
@@ -86,7 +87,7 @@ def _from_child(path: Path) -> dict[str, NDArray[Any]] | None:
         try:
             subprocess.run(
                 command,
-                env=_environment(),
+                env=environment(),
                 timeout=PATIENCE * _seconds(size),
                 check=True,
                 stdin=subprocess.DEVNULL,
@@ -100,13 +101,6 @@ def _from_child(path: Path) -> dict[str, NDArray[Any]] | None:
             return None
         with np.load(result) as arrays:
             return dict(arrays)
-
-
-def _environment() -> dict[str, str]:
-    """Return the environment of this process with the folder of this package on the path."""
-    root = str(Path(__file__).resolve().parents[2])
-    others = os.environ.get("PYTHONPATH", "")
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in (root, others) if p)}
 
 
 def _seconds(size: int) -> float:

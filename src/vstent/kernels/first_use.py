@@ -7,6 +7,8 @@ from contextlib import contextmanager
 
 from numba.core import event
 
+from vstent.children import environment
+
 
 @contextmanager
 def telling(tell: Callable[[], None], *, helper: Sequence[str] = ()) -> Iterator[None]:
@@ -45,7 +47,7 @@ def kept(call: Callable[[], None], command: Sequence[str]) -> None:
         with event.install_listener("numba:compile", _Refusal()):
             call()
     except _Unkept:
-        subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
+        subprocess.run(command, env=environment(), stdin=subprocess.DEVNULL, capture_output=True, check=False)
 
 
 class _Unkept(Exception):
@@ -85,7 +87,9 @@ class _Once(event.Listener):
         tell()
         if self._command:
             silent = subprocess.DEVNULL
-            self._helper = subprocess.Popen(self._command, stdin=silent, stdout=silent, stderr=silent)
+            self._helper = subprocess.Popen(
+                self._command, env=environment(), stdin=silent, stdout=silent, stderr=silent
+            )
 
     def on_end(self, event: event.Event) -> None:
         """Do nothing."""

@@ -13,6 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final, TypeVar
 
+from vstent.children import spawning
 from vstent.errors import VstentError
 
 Item = TypeVar("Item")
@@ -58,9 +59,11 @@ def spread(
         # before reading them.
         path = Path(folder) / "common.pickle"
         path.write_bytes(pickle.dumps((work, common)))
-        pool = ProcessPoolExecutor(min(jobs, len(items)), context, _start, (path,))
+        with spawning():
+            pool = ProcessPoolExecutor(min(jobs, len(items)), context, _start, (path,))
+            answers = pool.map(_answer, items)
         try:
-            yield from pool.map(_answer, items)
+            yield from answers
         except BrokenProcessPool as error:
             raise VstentError(
                 "a worker process ended (killed, or out of memory): give the same command again with fewer jobs"

@@ -13,6 +13,7 @@ from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Final, NamedTuple, TypeVar, final
 
+from vstent.children import SAFE, spawning
 from vstent.errors import InputError, VstentError
 
 Task = TypeVar("Task")
@@ -79,7 +80,8 @@ class Processes(AbstractCrew):
                 while waiting and len(running) < self.jobs:
                     number, attempt = waiting.pop()
                     process: BaseProcess = context.Process(target=_uninterrupted, args=(work, tasks[number]))
-                    process.start()
+                    with spawning():
+                        process.start()
                     running.append((process, number, attempt))
                 wait([one.sentinel for one, _, _ in running])
                 for ended in [one for one in running if one[0].exitcode is not None]:
@@ -170,7 +172,8 @@ class Slurm(AbstractCrew):
             from dask_jobqueue import SLURMCluster
         except ImportError:
             raise _missing("dask-jobqueue") from None
-        return SLURMCluster(cores=1, processes=1, memory=f"{SPARE * self.memory_MB:.0f}MB", job_name="vstent")
+        memory, prologue = f"{SPARE * self.memory_MB:.0f}MB", [f"export {name}={value}" for name, value in SAFE.items()]
+        return SLURMCluster(cores=1, processes=1, memory=memory, job_name="vstent", job_script_prologue=prologue)
 
 
 def _missing(package: str) -> InputError:
