@@ -343,7 +343,10 @@ def test_a_device_of_ones_own_joins_the_catalogue_and_can_be_replaced(own_folder
             "names a device that the catalogue already has, silk. Give it another key and",
         ),
         (OWN.replace(', confidence = "derived"', ""), "is wrong at device.0.braid.braid_angle_rad.confidence"),
-        (OWN.replace("value = 1.2, low = 1.1, high = 1.3", "value = 2.0, low = 1.9, high = 2.1"), "has an angle of 2.000 rad"),
+        (
+            OWN.replace("value = 1.2, low = 1.1, high = 1.3", "value = 2.0, low = 1.9, high = 2.1"),
+            "has an angle of 2.000 rad",
+        ),
         (OWN.replace("]]", "]"), "is not valid TOML"),
         (None, "does not exist"),
     ],

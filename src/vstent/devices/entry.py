@@ -168,8 +168,8 @@ class _Writer:
                 "reason": f"difference from the label, and {REASON}",
             }
             tolerance_mm = round(abs(value) + ERRORS * error, 2)
-            block: dict[str, Any] = {"diameters_mm": [diameter_mm], "lengths_mm": [length_mm], "length_tolerance_mm": tolerance_mm}
-            found.append(block | told)
+            block: dict[str, Any] = {"diameters_mm": [diameter_mm], "lengths_mm": [length_mm]}
+            found.append(block | {"length_tolerance_mm": tolerance_mm} | told)
         for diameter_mm in sorted({size.diameter_mm for size in self.like.sizes}) if has_all else ():
             lengths_mm = sorted(one.length_mm for one in self.like.sizes if one.diameter_mm == diameter_mm)
             one = self.ranges[LENGTH]

@@ -73,7 +73,7 @@ def beyond(mesh: Sheet, seed: int, points: Floats, normals: Floats) -> tuple[Flo
         Number of open edges of the mesh in it; -1 where the face is not beyond the plane.
     """
     rows = np.ascontiguousarray(points), np.ascontiguousarray(normals)
-    return _beyond(*mesh, seed, *rows)  # type: ignore[no-any-return]
+    return _beyond(*mesh, seed, *rows)
 
 
 @njit(cache=True)
