@@ -26,8 +26,8 @@ from vstent.devices.stent import Landing
 from vstent.errors import VstentError
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.surfaces import read_surface
-from vstent.kernels.sobol import centered_points
 from vstent.plan.bands import Band, bands, interval
+from vstent.plan.shares import centered_points
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 CASES = {"demo": "", "C0038": "aneurisk_C0038.vtp"}

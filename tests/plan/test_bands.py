@@ -15,9 +15,9 @@ from vstent.devices.catalogue import catalogue, find_design, find_size
 from vstent.devices.ranges import MARGIN, altered, uncertain, values_at
 from vstent.devices.stent import Landing
 from vstent.errors import VstentError
-from vstent.kernels.sobol import centered_points
 from vstent.plan.bands import BANDED, INTERVAL, SAMPLES, bands, interval, length_band
 from vstent.plan.rank import rank
+from vstent.plan.shares import centered_points
 from vstent.reporting.bands import ends, how_sure, number_name, rows
 
 SILK = find_design("silk")

@@ -21,10 +21,9 @@ from vstent.devices.stent import Deployment
 from vstent.errors import DeviceError, LandingError
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Floats
-from vstent.kernels.sobol import centered_points
 from vstent.plan.cells_in_bends import GAPS, NECK, plane
 from vstent.plan.reduced import Changed, Reduced
-from vstent.plan.shares import first_order_shares
+from vstent.plan.shares import centered_points, first_order_shares
 from vstent.plan.shortening import shortening
 
 LENGTH: Final = "deployed_length_mm"

@@ -1,4 +1,4 @@
-"""Share of each cause in the variance of a result (first-order Sobol indices).
+"""Samples of uncertain numbers, and the share of each in the variance of a result (first-order Sobol indices).
 
 The result is fitted by a constant plus Legendre polynomials of first and second degree in each cause alone. For
 uniform, independent causes these polynomials are orthonormal. The variance due to one cause is then the sum of its
@@ -18,6 +18,20 @@ STEADY: Final = 1e-9
 """Relative range of a result below which it counts as constant."""
 CONFIDENCE: Final = 0.95
 """Confidence of the F test by which the share of a cause must differ from chance."""
+
+
+def centered_points(dimensions: int, samples: int) -> Floats:
+    """Return the first points (n, d) of a Sobol sequence, -1 to 1, each in the middle of its stratum.
+
+    Parameters
+    ----------
+    dimensions : number d of uncertain numbers.
+    samples : number n of points; it is rounded up to a power of two.
+    """
+    from scipy.stats.qmc import Sobol  # its import takes a quarter of a second
+
+    unit = Sobol(dimensions, scramble=False).random_base2(int(np.ceil(np.log2(samples))))
+    return np.asarray(2 * (unit + 0.5 / len(unit)) - 1)
 
 
 def first_order_shares(points: Floats, values: Floats) -> Floats | None:

@@ -27,9 +27,8 @@ from vstent.flow.settings import FlowSettings
 from vstent.flow.simulation import Checkpoint, simulate_case
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Floats, freeze
-from vstent.kernels.sobol import centered_points
 from vstent.plan.ranges import Ranges
-from vstent.plan.shares import first_order_shares
+from vstent.plan.shares import centered_points, first_order_shares
 from vstent.plan.widening import widened
 
 CAUSES: Final = ("threshold", "landing", "device", "inflow")
