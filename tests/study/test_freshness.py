@@ -14,23 +14,25 @@ from vstent.io.writers import write_stl
 
 RUN = """
 import json, pathlib, sys
-from vstent.flow.case import FlowSettings
+from vstent.devices.treatment import with_device
+from vstent.flow.settings import FlowSettings, Numerics
 from vstent.reporting import write
 from vstent.study.pipeline import run
-from vstent.study.settings import Settings
+from vstent.study.settings import InputSettings, Settings
 
 path, out = map(pathlib.Path, sys.argv[1:])
 computed, told = [], []
 
-def progress(stage, fraction, detail):
-    if stage == "stored results":
-        told.append(detail)
-    elif fraction == 1.0 and detail != "already done":
-        computed.append(stage)
+def progress(now):
+    if now.stage == "stored results":
+        told.append(now.detail)
+    elif now.fraction == 1.0 and now.detail != "already done":
+        computed.append(now.stage)
 
 write._write = lambda *_: computed.append("report") or ""
-flow = FlowSettings(cell_size_mm=0.5, max_steps=20, inflow_mL_s=2.0)
-case = run(path, out, Settings(devices=("silk",), units="mm", flow=flow), progress)
+flow = FlowSettings(inflow_mL_s=2.0, numerics=Numerics(cell_size_mm=0.5, max_steps=20))
+settings = Settings(InputSettings("mm"), treatments=(with_device("silk"),), flow=flow)
+case = run(path, out, settings, progress)
 write.write_report(case, out)
 print(json.dumps({"computed": computed, "told": told}))
 """
@@ -71,6 +73,8 @@ def test_a_changed_line_computes_what_depends_on_it_and_nothing_else(tmp_path: P
     alter(package / "flow" / "simulation.py", '"""Compute one flow: steady', '"""Find one flow: steady')
     alter(package / "deployment" / "deploy.py", "\ndef deploy(", "\n# The only public function.\ndef deploy(")
     alter(package / "study" / "store.py", "self._held.clear()", "self._held[:] = []")
+    alter(package / "flow" / "settings.py", '"mean inflow of all inlets"', '"inflow of all inlets"')
+    alter(package / "fields.py", "is not yes or no", "is neither yes nor no")
     assert study(package.parent, tmp_path) == {"computed": [], "told": []}
 
     alter(package / "reporting" / "page.py", "\ndef as_html(", "\n_NEW = 1\n\n\ndef as_html(")

@@ -6,22 +6,25 @@ import os
 import shutil
 import subprocess
 import sys
-from dataclasses import asdict
+from collections.abc import Iterator
+from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from vstent import phantoms
 from vstent.cli import main
-from vstent.flow.settings import FlowSettings
+from vstent.devices.treatment import Implant, Placing, Treatment
+from vstent.fields import sections_of
+from vstent.flow.settings import Blood, CarreauYasuda, FlowSettings, Numerics
 from vstent.flow.waveform import OLDER_ADULT_ICA
 from vstent.io.writers import write_json, write_stl
 from vstent.plan.ranges import Ranges
 from vstent.study import repeat as repeating
 from vstent.study.crate import write_crate
 from vstent.study.repeat import agreement
-from vstent.study.settings import Settings
-from vstent.study.types import Placing
+from vstent.study.settings import AnatomySettings, InputSettings, Settings
 
 
 @pytest.fixture(scope="module")
@@ -150,23 +153,43 @@ ALL = Settings(
 """Settings of which every one differs from its default."""
 
 
-def changed(one: Any, path: str = "") -> list[str]:
+def changed(one: Any, path: str = "") -> Iterator[str]:
     """The paths of all settings in data classes that have another value than their default."""
-    found = []
     for field in fields(one):
         value = getattr(one, field.name)
-        for k, nested in enumerate(value if isinstance(value, tuple) else (value,)):
+        if value != field.default:
+            yield f"{path}{field.name}"
+        for nested in value if isinstance(value, tuple) else (value,):
             if is_dataclass(nested):
-                found += changed(nested, f"{path}{field.name}.{k}.")
-        if field.default is MISSING or value != field.default:
-            found.append(f"{path}{field.name}")
-    return found
+                yield from changed(nested, f"{path}{field.name}.")
+
+
+def known(kind: type, path: str = "") -> Iterator[str]:
+    """The paths of all settings."""
+    for field in fields(kind):
+        yield f"{path}{field.name}"
+        for section in sections_of(field.type):
+            yield from known(section, f"{path}{field.name}.")
 
 
 def test_settings_come_back_from_json_to_the_last_bit(tmp_path):
-    unchanged = {path for path, one in zip(everything(ALL), everything(ALL), strict=True)}
+    assert {*changed(ALL)} == {*known(Settings)}  # none is left out here
     write_json(tmp_path / "s.json", asdict(ALL), is_exact=True)
     assert repeating.settings_of(json.loads((tmp_path / "s.json").read_text())) == ALL
+
+
+@pytest.mark.parametrize(
+    "path", [(), ("input",), ("flow", "numerics"), ("flow", "blood", "thinning"), ("uncertainty",)]
+)
+def test_settings_of_another_version_are_refused(path):
+    """One more setting anywhere, or one less."""
+    for change in (lambda told: told.update(colour="red"), lambda told: told.pop(next(iter(told)))):
+        section = told = json.loads(json.dumps(asdict(ALL)))
+        for name in path.split():
+            section = section[name]
+        change(section)
+        with pytest.raises(ValueError, match="settings"):
+            repeating.settings_of(told)
 
 
 @pytest.mark.parametrize(
@@ -174,11 +197,11 @@ def test_settings_come_back_from_json_to_the_last_bit(tmp_path):
     [
         (
             11.0,
-            "1 of 2 metrics differ, stents.silk.b_mm most (relative difference 0.091, more than the 0.001",
+            "1 of 2 metrics differ, treatments.silk.b_mm most (relative difference 0.091, more than the 0.001",
         ),
         (
             10.005,
-            "1 of 2 metrics differ, stents.silk.b_mm most (relative difference 0.0005, within the 0.001",
+            "1 of 2 metrics differ, treatments.silk.b_mm most (relative difference 0.0005, within the 0.001",
         ),
         (10.0 + 1e-12, "The metrics agree except for rounding."),
         (10.0, "The metrics are identical to the last bit."),
@@ -186,7 +209,7 @@ def test_settings_come_back_from_json_to_the_last_bit(tmp_path):
 )
 def test_disagreement_is_told_by_its_worst(length_mm, told, tmp_path):
     for name, b_mm in (("one", 10.0), ("other", length_mm)):
-        metrics = {"vessel": {"a_mm": 1.0}, "stents": {"silk": {"b_mm": b_mm}}}
+        metrics = {"vessel": {"a_mm": 1.0}, "treatments": {"silk": {"b_mm": b_mm}}}
         write_json(tmp_path / name / "metrics.json", metrics, is_exact=True)
     assert agreement(tmp_path / "one", tmp_path / "other").startswith(told)
 

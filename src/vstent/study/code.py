@@ -1,6 +1,7 @@
 """Digest of the code that computes a result: the syntax trees of the modules that a function imports.
 
-Comments, docstrings, formatting, annotations of functions, and dates of files do not change it.
+Comments, docstrings, formatting, annotations of functions, dates of files, and what is said of the options of settings
+(`vstent.fields`) do not change it.
 """
 
 import ast
@@ -24,6 +25,9 @@ REMEMBERED: Final = "vstent.code.json"
 _BY_NAME: Final = "vstent.study"
 """Package of which only the functions count that are used, not whole modules: it orders and stores the stages."""
 
+_OF_OPTIONS: Final = "vstent.fields"
+"""Module on how settings are stated, which changes no result."""
+
 
 @cache
 def code_of(entry: str, without: tuple[str, ...] = ()) -> str:
@@ -40,7 +44,7 @@ def code_of(entry: str, without: tuple[str, ...] = ()) -> str:
     is_new = False
     while todo:
         name = todo.pop()
-        if name in found or name.startswith(without or "-"):
+        if name in found or name.startswith((*without, _OF_OPTIONS)):
             continue
         file = _file_of(name)
         state = [sys.version, state_of(file), state_of(Path(__file__))]
@@ -77,6 +81,8 @@ def _read(file: Path, function: str) -> tuple[str, list[str]]:
             node.annotation = None
         elif isinstance(node, ast.FunctionDef):
             node.returns = None
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "setting":
+            node.args, node.keywords = node.args[:1], []  # the default; the rest is its option
         for name, value in ast.iter_fields(node):
             if isinstance(value, list):
                 setattr(node, name, [one for one in value if not _is_silent(one)])

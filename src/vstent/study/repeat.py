@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -136,17 +136,17 @@ def settings_of(told: Mapping[str, Any]) -> Settings:
     Raises
     ------
     ValueError
-        This version does not know a setting or its value.
+        A setting is missing or has an impossible value, or this version does not know it.
     """
-    unknown = sorted(set(told) - {field.name for field in fields(Settings)})
-    if unknown:
-        raise ValueError(f"unknown settings: {unknown}")
-    return _adapter().validate_python(dict(told))
+    found = _adapter().validate_python(dict(told))
+    if json.loads(json.dumps(asdict(found))) != json.loads(json.dumps(told)):
+        raise ValueError("these are not all settings of this version, or others")
+    return found
 
 
 @cache
 def _adapter() -> "TypeAdapter[Settings]":
-    """Return the pydantic adapter that reads and checks the settings of a study."""
+    """Return the pydantic adapter that reads the settings of a study."""
     from pydantic import TypeAdapter  # its ValidationError is a ValueError
 
     return TypeAdapter(Settings)
