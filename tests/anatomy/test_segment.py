@@ -247,10 +247,15 @@ def test_a_point_far_from_any_vessel_is_refused(two_vessels):
 
 
 @pytest.mark.parametrize(
-    "voxels", [np.full((20, 20, 20), 7), np.eye(30)[:, :, None] * np.ones(30), np.zeros((2, 2, 2))]
+    ("voxels", "said"),
+    [
+        (np.full((20, 20, 20), 7), "no edges and therefore no contrast-filled lumen"),
+        (np.eye(30)[:, :, None] * np.ones(30), "largest object has 30 voxels"),
+        (np.zeros((2, 2, 2)), "2 x 2 x 2 voxels is too thin"),
+    ],
 )
-def test_a_scan_without_a_lumen_is_refused(voxels):
-    with pytest.raises(VesselError):
+def test_a_scan_without_a_lumen_is_refused(voxels, said):
+    with pytest.raises(VesselError, match=said):
         segment(Image(voxels, np.diag([0.3, 0.3, 0.3, 1.0])), threshold=None if voxels.std() < 1e-9 else 0.5)
 
 

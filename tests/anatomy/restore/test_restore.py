@@ -1,6 +1,8 @@
 """The parent artery under a sac of known shape."""
 
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,7 +29,8 @@ from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
 from vstent.errors import InputError
 from vstent.geometry.surface import Surface
-from vstent.geometry.vessel import Anatomy, Vessel
+from vstent.geometry.vessel import Anatomy, Aneurysm, Vessel
+from vstent.io.surfaces import read_surface
 from vstent.kernels import curves
 from vstent.phantoms import tube, with_sac
 
@@ -189,11 +192,15 @@ def test_low_wall_apart_from_every_opening_is_where_the_sac_touches_an_artery() 
     assert not _is_island(lumen, touching | artery | bridge).any()
 
 
-def test_a_sac_on_a_coarse_mesh_is_cut_where_its_branches_leave(shared_data) -> None:
-    from vstent.io.surfaces import read_surface
-
-    lumen = repair(read_surface(shared_data / "bifurcation_coarse.vtp")[0])[0]
+@cache
+def real_sac(path: Path) -> Aneurysm:
+    lumen = repair(read_surface(path)[0])[0]
     (aneurysm,) = restore(trim(trace(Vessel(lumen)))).aneurysms
+    return aneurysm
+
+
+def test_a_sac_on_a_coarse_mesh_is_cut_where_its_branches_leave(shared_data: Path) -> None:
+    aneurysm = real_sac(shared_data / "bifurcation_coarse.vtp")
     # One daughter runs along the sac, less than a triangle away: the neck must not climb between them.
     height_mm = np.ptp(aneurysm.neck_mm @ _mean_direction(aneurysm.neck))
     assert height_mm < 0.7 * np.sqrt(4 * aneurysm.neck.area_mm2 / np.pi)
@@ -201,8 +208,6 @@ def test_a_sac_on_a_coarse_mesh_is_cut_where_its_branches_leave(shared_data) -> 
 
 
 def test_a_sac_at_a_fork_is_what_the_fork_without_it_lacks(shared_data) -> None:
-    from vstent.io.surfaces import read_surface
-
     sick, healthy = (read_surface(shared_data / f"bifurcation_{name}_sac.stl")[0] for name in ("with", "without"))
     (aneurysm,) = restore(trace(Vessel(sick))).aneurysms
     lacking_mm3 = sick.closed.volume_mm3 - healthy.closed.volume_mm3
@@ -217,11 +222,7 @@ def test_a_sac_at_a_fork_is_what_the_fork_without_it_lacks(shared_data) -> None:
     "name", ["bifurcation_coarse.vtp", pytest.param("visc2011_metres.stl", marks=pytest.mark.validation)]
 )
 def test_the_neck_of_a_real_sac_has_no_hooks(shared_data, name: str) -> None:
-    from vstent.io.surfaces import read_surface
-
-    lumen = repair(read_surface(shared_data / name)[0])[0]
-    (aneurysm,) = restore(trim(trace(Vessel(lumen)))).aneurysms
-    assert sharpest_rad(aneurysm.neck_mm) < np.radians(50)
+    assert sharpest_rad(real_sac(shared_data / name).neck_mm) < np.radians(50)
 
 
 def sharpest_rad(ring_mm: np.ndarray) -> float:
@@ -352,8 +353,6 @@ def test_a_neck_that_is_none_is_refused(neck_mm: np.ndarray, complaint: str) -> 
 
 
 def test_the_real_sac_is_that_of_aneurisk_web(shared_data) -> None:
-    from vstent.io.surfaces import read_surface
-
     anatomy = restore(trim(trace(Vessel(read_surface(shared_data / "aneurisk_C0038.vtp")[0]))))
     (aneurysm,) = anatomy.aneurysms
     found = morphology(anatomy)

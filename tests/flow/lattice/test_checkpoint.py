@@ -14,7 +14,7 @@ from shapes import sphere
 from vstent import phantoms
 from vstent.anatomy.trace import trace
 from vstent.flow import engines
-from vstent.flow.case import FlowField, Sheet, Target
+from vstent.flow.case import FlowCase, FlowField, Sheet, Target
 from vstent.flow.lattice import stepping
 from vstent.flow.problem import vessel_case
 from vstent.flow.settings import FlowSettings, Numerics, Waveform
@@ -57,14 +57,9 @@ class Stopping(Unfinished):
             raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("kind", ["steady", "pulsatile", "stented", "close-up", "pulsatile close-up"])
-@pytest.mark.parametrize("saves", [2, 9])
-def test_a_stopped_flow_goes_on_to_the_same_bits(
-    kind: str, saves: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(engines, "SAVE_EVERY_S", 0.0)
-    monkeypatch.setattr(engines, "SAVE_SHARE", np.inf)
-    monkeypatch.setattr(stepping, "SLICE_UPDATES", 5e5)  # stops between checks too
+@cache
+def computed(kind: str) -> tuple[FlowCase, FlowField | None, FlowField]:
+    """A case, the flow from which it starts, and its own flow in one go."""
     settings = PULSE if "pulsatile" in kind else SETTINGS
     case = vessel_case(vessel(), settings)
     start = None
@@ -75,8 +70,19 @@ def test_a_stopped_flow_goes_on_to_the_same_bits(
         sac = Surface(sphere(1.0).vertices_mm + np.array([0.0, 0.0, 5.0]), sphere(1.0).faces)
         numerics = replace(settings.numerics, cell_size_mm=0.2, close_up=True)
         case = replace(case, target=Target(sac, None), numerics=numerics)
-    whole = simulate_case(case, start=start)
-    stopping = Stopping(tmp_path, "flow", "key")
+    return case, start, simulate_case(case, start=start)
+
+
+@pytest.mark.parametrize("kind", ["steady", "pulsatile", "stented", "close-up", "pulsatile close-up"])
+@pytest.mark.parametrize("saves", [2, 9])
+def test_a_stopped_flow_goes_on_to_the_same_bits(
+    kind: str, saves: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engines, "SAVE_EVERY_S", 0.0)
+    monkeypatch.setattr(engines, "SAVE_SHARE", np.inf)
+    monkeypatch.setattr(stepping, "SLICE_UPDATES", 5e5)  # stops between checks too
+    case, start, whole = computed(kind)
+    stopping = Stopping(tmp_path, "flow-key")
     stopping.last = saves
     with pytest.raises(KeyboardInterrupt):
         simulate_case(case, start=start, checkpoint=stopping)

@@ -249,8 +249,8 @@ def test_struts_over_an_ostium_are_meshed_in_as_many_cells_as_told_and_hold_bloo
         wire_diameter_um=np.full_like(stent.wire_diameter_um, 400.0),
     )
     branch_mL_s = []
-    for name, device in (("bare", None), ("thick", thick)):
-        case = flow_case(anatomy, (device,), FlowSettings(inflow_mL_s=FLOW_ML_S, numerics=Numerics(tolerance=0.02)))
+    for name, devices in (("bare", ()), ("thick", (thick,))):
+        case = flow_case(anatomy, devices, FlowSettings(inflow_mL_s=FLOW_ML_S, numerics=Numerics(tolerance=0.02)))
         engine = OpenFoam(0.35, tmp_path / name, layers=0)
         field = run(engine, case)
         assert field.outlets_mL_s.sum() == pytest.approx(FLOW_ML_S, rel=1e-3)
