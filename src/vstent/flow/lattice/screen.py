@@ -1,22 +1,23 @@
 """The screen of a case on the lattice: the resistance of its media in the grid cells near them, in lattice units.
 
 Sheets that share a cell add as tensors: sheet k resists the velocity u of the cell with a_k (u.n_k) n_k along its
-normal and with b_k (u - (u.n_k) n_k) across it, and its inertial loss is added. A cell stores one axis with a resistance along
-and across it. The axis is that of the normals: the one that they share, or the line along which two sheets meet if they
-cross at more than 70 degrees. The resistances are those of the summed tensor along this axis, and its mean across it.
-This is exact for parallel sheets and for equal ones that meet at a right angle. In between a cell on the line where two
-sheets meet is off by at most 14 % where a and b differ by a factor of two. Blood that passes two planes crossing every
-16 cells is 6 % too fast where the tensor is exact and 6 to 9 % where it is not: six coefficients would gain little.
+normal and with b_k (u - (u.n_k) n_k) across it, and its inertial loss is added. A cell stores one axis with a
+resistance along and across it. The axis is that of the normals: the one that they share, or the line along which two
+sheets meet if they cross at more than 70 degrees. The resistances are those of the summed tensor along this axis, and
+its mean across it. This is exact for parallel sheets and for equal ones that meet at a right angle. In between a cell
+on the line where two sheets meet is off by at most 14 % where a and b differ by a factor of two. Blood that passes two
+planes crossing every 16 cells is 6 % too fast where the tensor is exact and 6 to 9 % where it is not: six coefficients
+would gain little.
 
 `GridResistance.spread_Pa_s_m` is the mean of the sheets, weighted by their tangential resistance. Two sheets within a
 cell of each other are spread over the same layers, and the velocity along them behind both is then less certain than
 behind one: within 15 % for 60 Pa s/m each, and 40 % too low (both at the same place) to 60 % too high (half a cell
 apart) for 380. From two cells apart on each acts as alone (`tests/flow/test_screen_sheet.py`).
 
-Meshes of two implants closer than about a wire spacing lose more than the sum, because the wires of one narrow the
-gaps of the other. This is not modelled. In the drag law of a row (`vstent.flow.drag`) two like braids staggered in one plane,
-one braid of half the spacing, resist 1.9 times (d / s = 0.11) to 2.4 times (0.17) the sum of both alone. Meshes farther
-apart than a spacing add.
+Meshes of two implants closer than about a wire spacing lose more than the sum, because the wires of one narrow the gaps
+of the other. This is not modelled. In the drag law of a row (`vstent.flow.drag`) two like braids staggered in one
+plane, one braid of half the spacing, resist 1.9 times (d / s = 0.11) to 2.4 times (0.17) the sum of both alone. Meshes
+farther apart than a spacing add.
 """
 
 from collections.abc import Sequence
