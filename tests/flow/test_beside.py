@@ -95,8 +95,8 @@ def test_a_study_that_fails_does_not_lose_what_was_begun() -> None:
     assert done == ["late"]
 
 
-def case(settings: FlowSettings) -> FlowCase:
-    return vessel_case(tube(line(8.0), 2.0).vessel, settings)
+def case(numerics: Numerics) -> FlowCase:
+    return vessel_case(tube(line(8.0), 2.0).vessel, FlowSettings(inflow_mL_s=0.5, numerics=numerics))
 
 
 class Engine(LatticeBoltzmann):

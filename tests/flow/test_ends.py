@@ -1,4 +1,4 @@
-"""Boundary conditions of the openings: what settings mean, and that every type keeps its value and the mass."""
+"""Boundary conditions of the openings: what the settings say, and that each type keeps its value and the mass."""
 
 from dataclasses import replace
 from functools import cache

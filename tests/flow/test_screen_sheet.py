@@ -31,19 +31,14 @@ def samples(normal: np.ndarray, resistance_Pa_s_m: float, offset: float) -> Shee
     return Sheet(points_mm, np.tile(normal, (len(x), 1)), area_mm2, alike, alike, 0 * alike, alike, alike)
 
 
-def entries(screen: Sheet) -> tuple[np.ndarray, np.ndarray]:
+def entries(media: tuple[Sheet, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Cells (e,) of the box, and what they resist (e, ENTRY): what lies beyond a side comes in at the other."""
     around = np.stack(np.meshgrid(*(np.arange(-1, n + 1) for n in SHAPE), indexing="ij"), axis=-1) % SHAPE
-    number = np.ravel_multi_index(tuple(np.moveaxis(around, -1, 0)), tuple(SHAPE)).ravel()
-    index = np.arange(len(number), dtype=np.int32).reshape(SHAPE + 2)
-    spread = on_grid((screen,), index, np.full(3, -1e3 * CELL_M), 1e3 * CELL_M)
+    index = np.ravel_multi_index(tuple(np.moveaxis(around, -1, 0)), tuple(SHAPE)).astype(np.int32)
+    spread = on_grid(media, index, np.full(3, -1e3 * CELL_M), 1e3 * CELL_M)
     linear = np.stack([spread.along_Pa_s_m2, spread.across_Pa_s_m2], axis=1) * STEP_S / DENSITY_KG_M3
     twice = spread.spread_Pa_s_m / DENSITY_KG_M3 * STEP_S / CELL_M
-    cell, of = np.unique(number[spread.cell], return_inverse=True)
-    mean = np.stack([np.bincount(of, linear[:, 1] * c) for c in (*spread.normal.T, twice)], axis=1)
-    total = np.stack([np.bincount(of, column) for column in linear.T], axis=1)
-    mean /= total[:, 1:]
-    return cell, np.column_stack([mean[:, :3], total, 0 * cell, mean[:, 3]]).astype(np.float32)
+    return spread.cell, np.column_stack([spread.normal, linear, 0 * twice, twice]).astype(np.float32)
 
 
 def row(diameter_mm: float, spacing: int, offset: float) -> Sheet:
@@ -64,7 +59,7 @@ def row(diameter_mm: float, spacing: int, offset: float) -> Sheet:
 class Box:
     """The box's populations, and what drives them."""
 
-    def __init__(self, screen: Sheet, force: np.ndarray, velocity: np.ndarray) -> None:
+    def __init__(self, media: tuple[Sheet, ...], force: np.ndarray, velocity: np.ndarray) -> None:
         self.cells = np.argwhere(np.ones(SHAPE, bool))
         last = SHAPE[2] - 1
         cut = (self.cells[:, 2] == 0) | (self.cells[:, 2] == 1) | (self.cells[:, 2] == last)
@@ -74,7 +69,7 @@ class Box:
         behind = [self._number(self.cells[first] - c) for c in directions.VELOCITIES]
         odd = np.stack([d3q19.OPPOSITE[q] * len(cut) + behind[q] for q in range(19)], axis=1)
         self.address = np.stack([even, odd]).astype(np.int32)
-        cell, entry = entries(screen)
+        cell, entry = entries(media)
         segment = np.searchsorted(first, cell, side="right") - 1
         start = np.searchsorted(segment, np.arange(len(first) + 1)).astype(np.int32)
         self.screen = start, (cell - first[segment]).astype(np.int32), entry
@@ -115,7 +110,7 @@ def test_blood_leaves_a_screen_as_it_would_leave_a_thin_sheet(
     away = (np.argwhere(np.ones(SHAPE, bool)) @ (n / n[2]) - SHAPE[2] / 2 - offset) % SHAPE[2] * n[2]
     gain = resistance * leaving / height / through
     arriving = leaving + gain * (away - height * np.exp((away - height) * through / VISCOSITY))
-    box = Box(samples(n, resistance_Pa_s_m, offset), force, through * n + arriving[:, None] * along)
+    box = Box((samples(n, resistance_Pa_s_m, offset),), force, through * n + arriving[:, None] * along)
     before, now = np.zeros(len(away)), arriving
     for _ in range(200):
         if np.abs(now - before).max() < SETTLED * np.abs(now).max():
@@ -131,6 +126,96 @@ def test_blood_leaves_a_screen_as_it_would_leave_a_thin_sheet(
     np.testing.assert_allclose(box.velocity()[behind] @ n, through, rtol=0.01)
 
 
+def speeds_along(levels: list[float], resistances: list[float], through: float, force: float) -> np.ndarray:
+    """Speed along thin sheets, in the layers of the box: steady advection and diffusion, driven by a uniform force."""
+    height = float(SHAPE[2])
+    steep = -1 / (through * np.expm1(through * height / VISCOSITY))
+
+    def response(z: np.ndarray | float) -> np.ndarray | float:
+        """Speed at a height over a sheet of unit drag, but for a constant."""
+        return steep * np.exp(through * (z % height) / VISCOSITY) + (z % height) / (through * height)
+
+    at = np.array([[response(here - there) for there in levels] for here in levels])
+    balance = np.block([[np.eye(len(levels)) - at * resistances, -np.ones((len(levels), 1))], [*resistances, 0.0]])
+    *speeds, constant = np.linalg.solve(balance, [*np.zeros(len(levels)), force * height])
+    layers = np.arange(SHAPE[2], dtype=float)
+    drags = zip(levels, np.array(resistances) * speeds, strict=True)
+    return constant + sum(drag * response(layers - level) for level, drag in drags)
+
+
+@pytest.mark.parametrize(
+    ("resistance_Pa_s_m", "offsets", "within"),
+    [
+        (60.0, (0.25, 0.25), 0.10),
+        (60.0, (0.0, 0.5), 0.13),
+        (60.0, (0.0, 1.0), 0.04),
+        (380.0, (0.0, 0.0), 0.06),
+        (380.0, (0.0, 1.0), 0.07),
+        (380.0, (0.0, 8.0), 0.04),
+    ],
+)
+def test_blood_leaves_two_sheets_in_one_cell_or_in_several_as_it_would_leave_two_thin_ones(
+    resistance_Pa_s_m: float, offsets: tuple[float, float], within: float
+) -> None:
+    through, force = 0.05 * STEP_S / CELL_M, 1e-5
+    resistance = resistance_Pa_s_m / DENSITY_KG_M3 * STEP_S / CELL_M
+    levels = [SHAPE[2] / 2 + offset for offset in offsets]
+    expected = speeds_along(levels, [resistance, resistance], through, force)
+    start = np.stack([expected, 0 * expected, np.full(len(expected), through)], axis=1)
+    media = tuple(samples(np.array([0.0, 0.0, 1.0]), resistance_Pa_s_m, offset) for offset in offsets)
+    box = Box(media, np.array([force, 0.0, 2 * resistance * through / SHAPE[2]]), np.tile(start, (SHAPE[:2].prod(), 1)))
+    before, now = 0 * expected, expected
+    for _ in range(200):
+        if np.abs(now - before).max() < SETTLED * np.abs(now).max():
+            break
+        box.advance(250)
+        before, now = now, box.velocity()[: SHAPE[2], 0]
+    else:
+        pytest.fail("the flow through the box has not settled")
+    away = np.arange(5, 11)  # cells behind both
+    behind = (int(max(levels)) + away) % SHAPE[2]
+    (slope, found), (gain, leaving) = (np.polyfit(away, one[behind], 1) for one in (now, expected))
+    assert slope == pytest.approx(gain, rel=0.03)
+    assert found == pytest.approx(leaving, rel=within)
+    # The drop is the sum of both, wherever they are.
+    assert box.velocity()[:, 2].mean() == pytest.approx(through, rel=2e-3)
+
+
+def crossing(normal: tuple[float, float, float], resistance_Pa_s_m: float) -> tuple[Sheet, float]:
+    """A plane that repeats with the box and resists along its normal only, and its area per volume, in cells."""
+    n = np.array(normal) / np.linalg.norm(normal)
+    x, y = (a.ravel() for a in np.meshgrid(*((np.arange(8 * size) + 0.5) / 8 for size in (2 * SHAPE[0], SHAPE[1]))))
+    level = SHAPE[2] / 2 + 0.25
+    at = (level - x * n[0] / n[2], x) if normal[2] else (x, np.full(len(x), level))
+    points_mm = 1e3 * CELL_M * np.stack([at[1], y, at[0]], axis=1) % (1e3 * CELL_M * SHAPE)
+    # A plane of slope 1/2 closes on itself after twice the box; the others are laid twice.
+    laid = 1 if normal == (1, 0, 2) else 2
+    area = (1 / 8) ** 2 / (n[2] or 1.0) / laid
+    one = np.ones(len(x))
+    lying = np.tile(n, (len(x), 1)), area * (1e3 * CELL_M) ** 2 * one
+    sheet = Sheet(points_mm, *lying, resistance_Pa_s_m * one, 0 * one, 0 * one, one, one)
+    return sheet, area * len(x) / SHAPE.prod()
+
+
+@pytest.mark.parametrize(
+    ("normal", "within"), [((0, 0, 1), 1e-3), ((1, 0, 2), 0.01), ((1, 0, 1), 0.01), ((1, 0, 0), 0.05)]
+)
+def test_blood_passes_two_sheets_that_cross_as_it_would_pass_both(normal: tuple[int, int, int], within: float) -> None:
+    """Sheets that resist along their normals only let a uniform flow be: what drives it is the drag of both."""
+    velocity = np.array([0.03, 0.0, 0.05]) * STEP_S / CELL_M
+    force, media = np.zeros(3), []
+    for one in ((0, 0, 1), normal):
+        sheet, dense = crossing(one, 380.0)
+        n = np.array(one) / np.linalg.norm(one)
+        force += 380.0 / DENSITY_KG_M3 * STEP_S / CELL_M * dense * (n @ velocity) * n
+        media.append(sheet)
+    box = Box(tuple(media), force, np.tile(velocity, (SHAPE.prod(), 1)))
+    box.advance(1500)
+    off = box.velocity().mean(axis=0) - velocity
+    # Along a direction in which neither resists, nothing but the start sets the velocity.
+    assert np.linalg.norm(off) < within * np.linalg.norm(velocity)
+
+
 @pytest.mark.parametrize(
     ("diameter_mm", "spacing", "offset"),
     [(0.09, 4, 0.0), (0.09, 8, 0.0), (0.09, 8, 0.25), (0.09, 8, 0.5), (0.03, 8, 0.25), (0.09, 16, 0.25)],
@@ -144,7 +229,7 @@ def test_wires_that_the_grid_tells_apart_hold_slow_blood_up_as_their_row_does(
     expected = 1e-3 * STEP_S / CELL_M
     force = VISCOSITY * drag_per_length(1e-3 * diameter_mm, spacing_m) / spacing * expected / SHAPE[2]
     start = np.tile([0.0, 0.0, expected], (SHAPE.prod(), 1))
-    box = Box(row(diameter_mm, spacing, offset), np.array([0.0, 0.0, force]), start)
+    box = Box((row(diameter_mm, spacing, offset),), np.array([0.0, 0.0, force]), start)
     before, now = 0.0, expected
     for _ in range(100):
         if abs(now - before) < 1e-4 * expected:

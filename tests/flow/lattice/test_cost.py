@@ -22,11 +22,12 @@ from vstent.flow.simulation import simulate_case
 from vstent.flow.waveform import OLDER_ADULT_ICA
 from vstent.geometry.surface import Surface
 
-SETTINGS = FlowSettings(inflow_mL_s=2.0, numerics=Numerics(cell_size_mm=0.2))
+NUMERICS = Numerics(cell_size_mm=0.2)
 
 
-def case_of(**changes):
-    return vessel_case(tube(line(8.0), 2.0).vessel, replace(SETTINGS, **changes))
+def case_of(inflow_mL_s=2.0, waveform=None, **numerics):
+    settings = FlowSettings(inflow_mL_s=inflow_mL_s, waveform=waveform, numerics=replace(NUMERICS, **numerics))
+    return vessel_case(tube(line(8.0), 2.0).vessel, settings)
 
 
 def test_the_cells_foretold_are_the_grids():
@@ -128,10 +129,8 @@ def test_a_guess_whose_grid_is_too_coarse_is_done_without(monkeypatch):
     radius = 2.0 - 1.75 * np.exp(-(((points[:, 2] - 8.0) / 1.5) ** 2))
     turn = np.array([[1, 0, 1], [0, 2**0.5, 0], [-1, 0, 1]]) / 2**0.5
     vessel = tube((points @ turn.T, frames @ turn.T), radius).vessel
-    case, tried = (
-        vessel_case(vessel, replace(SETTINGS, numerics=replace(SETTINGS.numerics, cell_size_mm=0.11, max_steps=60))),
-        [],
-    )
+    settings = FlowSettings(inflow_mL_s=2.0, numerics=Numerics(cell_size_mm=0.11, max_steps=60))
+    case, tried = vessel_case(vessel, settings), []
     real = LatticeBoltzmann.init
 
     def told(engine, case, start):
