@@ -1,3 +1,4 @@
+import re
 import shutil
 from dataclasses import replace
 
@@ -6,12 +7,10 @@ import numpy as np
 import pydicom
 import pytest
 import SimpleITK
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from vstent.anatomy.segment import segment
-from vstent.errors import InputError, ReadError, UnitError
+from vstent.errors import ReadError, UnitError
 from vstent.geometry.image import Image
 from vstent.io.dicom_writer import write_dicom
 from vstent.io.images import files_of, read_image
@@ -91,7 +90,9 @@ def test_other_files_and_smaller_series_are_passed_over(oblique, series):
     directory.save_as(series / "report.dcm")
     image = read_image(series)
     np.testing.assert_array_equal(image.voxels, oblique.voxels)
-    assert image.notes == ("2 DICOM series found; the largest, of 7 files, is used.",)
+    assert re.match(
+        r"2 DICOM series found\. Series 1 '.*' \(.*, 7 slices\) is used; others: 1 .*4 slices", image.notes[0]
+    )
 
 
 def test_one_file_stands_for_its_series(oblique, series):
@@ -364,17 +365,12 @@ def test_a_file_that_breaks_off_is_refused(oblique, tmp_path, suffix):
         read_image(file)
 
 
-@pytest.mark.parametrize("has_links", [True, False])
 @pytest.mark.parametrize("wanted", [".nii", ".nii.gz", ".NII.gz"])
-def test_a_nifti_file_is_read_and_not_one_beside_it_that_differs_in_its_suffix(
-    oblique, tmp_path, monkeypatch, wanted, has_links
-):
+def test_a_nifti_file_is_read_and_not_one_beside_it_that_differs_in_its_suffix(oblique, tmp_path, wanted):
     for suffix in (".nii", ".nii.gz", ".hdr"):
         shifted = Image(oblique.voxels + (1000 if suffix == wanted.lower() else 0), oblique.affine_mm)
         SimpleITK.WriteImage(itk_scan(shifted), str(tmp_path / f"scan{suffix}"))
     (tmp_path / f"scan{wanted.lower()}").rename(tmp_path / f"scan{wanted}")
-    if not has_links:
-        monkeypatch.setattr("pathlib.Path.symlink_to", refused)
     np.testing.assert_array_equal(read_image(tmp_path / f"scan{wanted}").voxels, oblique.voxels + 1000)
 
 
@@ -565,10 +561,6 @@ def test_odd_names_of_voxels_are_not_among_the_files(tmp_path, name):
     assert files_of(scan) == [scan]
 
 
-def refused(*_):
-    raise OSError("no links here")
-
-
 def test_nifti_without_pixel_sizes_is_refused(oblique, tmp_path):
     file = tmp_path / "scan.nii"
     SimpleITK.WriteImage(itk_scan(oblique), str(file))
@@ -665,49 +657,3 @@ def test_real_raw_scan(shared_data):
     i, j, k = np.ogrid[:256, :256, :256]
     in_sac = (i - 110) ** 2 + (j - 106) ** 2 + (k - 160) ** 2 < 9**2
     assert np.mean(image.voxels[in_sac] > 120) > 0.98
-
-
-# -- damage ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def sound_files(oblique, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("sound")
-    for suffix in (".nii", ".nii.gz", ".nrrd", ".mha"):
-        SimpleITK.WriteImage(itk_scan(oblique), str(folder / f"scan{suffix}"))
-    write_dicom(Image(oblique.voxels[:, :, :3], oblique.affine_mm), folder / "scan")
-    return folder
-
-
-def read_or_refuse(path):
-    try:
-        return read_image(path)
-    except InputError as error:
-        return str(error)
-
-
-@settings(max_examples=120, deadline=10_000)
-@given(
-    name=st.sampled_from(["scan.nii", "scan.nii.gz", "scan.nrrd", "scan.mha", "scan"]),
-    cut=st.floats(0, 1),
-    changes=st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), max_size=12),
-)
-def test_damaged_scans_are_read_or_refused_but_never_crash(sound_files, tmp_path_factory, name, cut, changes):
-    folder = tmp_path_factory.mktemp("damaged", numbered=True)
-    target = folder / name
-    if name == "scan":
-        shutil.copytree(sound_files / name, target)
-        file = target / "IM0002.dcm"
-    else:
-        file = shutil.copy(sound_files / name, target)
-    data = bytearray(file.read_bytes())
-    data = data[: int(np.ceil((1 - cut**4) * len(data)))]
-    for where, value in changes:
-        if data:
-            data[int(where**2 * len(data))] = value
-    file.write_bytes(bytes(data))
-    answer = read_or_refuse(target)
-    if isinstance(answer, Image):
-        assert np.isfinite(answer.affine_mm).all()
-    else:
-        assert "\n" not in answer
