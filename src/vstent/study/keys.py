@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 from vstent.devices.catalogue import find_design
 from vstent.devices.treatment import BARE, Implant, Treatment
-from vstent.errors import ReadError
 from vstent.flow.settings import LATTICE
 from vstent.io.files import existing
 from vstent.io.images import files_of
