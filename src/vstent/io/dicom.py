@@ -694,10 +694,11 @@ def _refuse_gaps(slices: list[_Slice], height: Floats) -> None:
                 f"{missing} slice{'s are' if missing > 1 else ' is'} missing between {before} and {after} "
                 f"({height[i]:.3f} to {height[i + 1]:.3f} mm, elsewhere {usual:.3f} mm apart). Export the series again."
             )
+    for i, step in enumerate(steps):  # a missing slice is the better reason where both are found
         if abs(step - usual) > SPACING_TOLERANCE * usual:
             raise ReadError(
-                f"Slice {after} is {step:.3f} mm from {before}, but slices are {usual:.3f} mm apart elsewhere. "
-                "Export the series with equal distances."
+                f"Slice {slices[i + 1].name} is {step:.3f} mm from {slices[i].name}, but slices are {usual:.3f} mm "
+                "apart elsewhere. Export the series with equal distances."
             )
 
 

@@ -11,7 +11,7 @@ from vstent.errors import ReadError, UnitError
 from vstent.geometry.surface import Surface
 from vstent.io.apart import read_apart
 from vstent.io.double_wall import inner_wall
-from vstent.io.files import SURFACE_SUFFIXES, existing, suffix
+from vstent.io.files import SURFACE_SUFFIXES, existing, is_vtk_image, suffix
 from vstent.kernels import topology, triangles
 from vstent.units import MM_PER
 
@@ -104,6 +104,8 @@ def _read(path: Path) -> tuple[Surface, str]:
         )
     if path.is_dir() or path.stat().st_size == 0:
         raise ReadError(f"{path.name} is {'a folder' if path.is_dir() else 'empty'}, not a surface file.")
+    if is_vtk_image(path):
+        raise ReadError(f"{path.name} is a scan, not a surface. Read it with vstent.read_image.")
     _refuse_mislabelled(path, kind)
     if kind == ".stl" and _is_torn_text(path):
         raise ReadError(f"{path.name} holds fewer triangles than it states: it breaks off. Copy or export it again.")
