@@ -14,7 +14,7 @@ from vstent.devices.treatment import with_device
 from vstent.flow.openfoam.dictionary import parse
 from vstent.geometry.surface import Surface
 from vstent.io.surfaces import read_surface
-from vstent.io.vtk_child import read_apart
+from vstent.io.vtk_reader import read_mesh
 from vstent.io.writers import write_stl
 from vstent.study.pipeline import run
 from vstent.study.settings import InputSettings, Settings
@@ -58,7 +58,7 @@ def test_patches_of_a_studied_case_are_watertight(studied: Path, tmp_path: Path)
     assert whole.area_mm2 == pytest.approx(sum(one["area_mm2"] for one in said.values()), rel=1e-4)
     sac, _ = read_surface(studied / "sac.vtp", units="mm")
     assert said["sac"]["area_mm2"] < sac.area_mm2  # without its neck
-    neck = Surface(*read_apart(out / "neck.stl")[:2])
+    neck = Surface(*read_mesh(out / "neck.stl")[:2])
     assert said["sac"]["area_mm2"] + neck.area_mm2 == pytest.approx(sac.area_mm2, rel=0.02)
 
 
@@ -72,8 +72,8 @@ def test_an_openfoam_case_of_a_studied_case_has_its_device_over_the_neck(studied
     assert not (out / ".vstent").exists()
     geometry = parse((out / "system" / "snappyHexMeshDict").read_text())["geometry"]
     assert set(geometry) == {"lumen", "neck", "struts", "before_outlet_2"}  # the branch is narrow
-    whole = Surface(*read_apart(studied / "treatments" / "enterprise" / "implants" / "enterprise" / "struts.stl")[:2])
-    near = Surface(*read_apart(out / "constant" / "triSurface" / "struts.stl")[:2])
+    whole = Surface(*read_mesh(studied / "treatments" / "enterprise" / "implants" / "enterprise" / "struts.stl")[:2])
+    near = Surface(*read_mesh(out / "constant" / "triSurface" / "struts.stl")[:2])
     assert 0.2 < near.area_mm2 * 1e6 / whole.area_mm2 < 0.5
     assert whole.closest(near.vertices_mm * 1e3)[1].max() < 0.01  # the last section before a cut turns a little
     lumen, _ = read_surface(out / "constant" / "triSurface" / "lumen.stl", units="m")

@@ -40,7 +40,7 @@ def read_vessel(  # noqa: PLR0913 one keyword for each property that a file may 
     crop_mm : (2, 3) opposite corners in LPS mm of the box along the image axes to which a scan is cropped; None: the
         whole scan.
     threshold : intensity at the lumen wall of a scan; None: half way between tissue and lumen.
-    at_mm : (3,) point in LPS mm near the requested vessel; None: the largest one.
+    at_mm : (3,) point in LPS mm near the requested vessel; None: the largest with a bulge, or the largest one.
 
     Returns
     -------

@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 
+from vstent.anatomy.bulge import bulging, prominence_of_surface
 from vstent.errors import VesselError
 from vstent.geometry.surface import Surface
 from vstent.kernels import topology, triangles
@@ -94,7 +95,7 @@ def _once(mesh: _Mesh, at_mm: Floats | None) -> _Mesh:
 
 
 def _welded(mesh: _Mesh) -> _Mesh:
-    """Return the mesh with duplicate vertices merged."""
+    """Return the mesh with duplicate vertices merged, and those of triangles that miss each other."""
     vertices, faces = triangles.compact(mesh.vertices, mesh.faces)
     extent = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     welded, faces = topology.weld(vertices, faces, WELD_OF_EXTENT * extent)
@@ -102,7 +103,10 @@ def _welded(mesh: _Mesh) -> _Mesh:
     note = (
         f"{counted(n, 'duplicate vertex', 'duplicate vertices')} merged (closer than {WELD_OF_EXTENT * extent:.1g} mm)."
     )
-    return mesh.after(welded, faces, note if n else "")
+    mesh = mesh.after(welded, faces, note if n else "")
+    faces, width_mm = topology.without_cracks(welded, faces)
+    note = f"The triangles of the file do not meet: vertices up to {width_mm:.1g} mm apart were merged."
+    return mesh.after(welded, faces, note if width_mm else "")
 
 
 def _cleaned(mesh: _Mesh) -> _Mesh:
@@ -154,17 +158,22 @@ def _unzipped(mesh: _Mesh) -> _Mesh:
 
 
 def _one_piece(mesh: _Mesh, at_mm: Floats | None) -> _Mesh:
-    """Return the mesh with the largest piece only, or the notable piece nearest to a point (3,)."""
+    """Return the mesh with one piece: the one nearest to a point (3,), else that with a bulge, else the largest."""
     label = topology.face_components(mesh.faces)
     area = np.bincount(label, triangles.areas(mesh.vertices[mesh.faces]))
     if len(area) <= 1:
         return mesh
     order = np.argsort(-area)
     notable = [k for k in order if k == order[0] or area[k] > NOTABLE_OF_AREA * area.sum()]
-    kept = notable[0] if at_mm is None else min(notable, key=lambda k: _gap_mm(mesh, label == k, at_mm))
+    if at_mm is None:
+        kept = bulging(area, lambda k: prominence_of_surface(Surface(mesh.vertices, mesh.faces[label == k])))
+    else:
+        kept = min(notable, key=lambda k: _gap_mm(mesh, label == k, at_mm))
     left = [f"{area[k]:.1f} mm2 about {_middle(mesh, label == k)}" for k in notable if k != kept]
     note = f"{counted(len(area) - 1, 'loose piece')} removed ({area[kept] / area.sum():.1%} of the area kept)"
     note += f", the largest of them {', '.join(left)}; choose another piece by a point near it (--at)." if left else "."
+    if at_mm is None and kept != order[0]:
+        note += " The piece with a bulge was kept, not the largest one."
     return mesh.after(mesh.vertices, mesh.faces[label == kept], note)
 
 

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.special import ndtr
 
+from vstent.anatomy.bulge import bulging, prominence
+from vstent.anatomy.masks import prepared
 from vstent.errors import VesselError
 from vstent.geometry.image import Image
 from vstent.geometry.surface import Surface
@@ -59,7 +61,7 @@ def segment(image: Image, *, threshold: float | None = None, at_mm: Floats | Non
 
     Parameters
     ----------
-    image : scan in which blood is brighter than the surrounding tissue.
+    image : scan in which blood is brighter than the surrounding tissue, mask or label map (see `prepared`).
     threshold : intensity of the wall; where not given, half way between tissue and lumen, see `propose`.
     at_mm : (3,) point in or near the requested vessel in mm; the largest vessel where not given.
 
@@ -74,6 +76,7 @@ def segment(image: Image, *, threshold: float | None = None, at_mm: Floats | Non
         When no lumen is found: no object of sufficient size is brighter than the threshold or near the point, or the
         object is wider than any artery.
     """
+    image = prepared(image, is_united=threshold is None)
     lumen, notes, profile = propose(image, at_mm=at_mm) if threshold is None else _at(image, float(threshold), at_mm)
     _refuse_wide(lumen, profile)
     surface, smooth_note = _smooth(_wall(lumen))
@@ -262,7 +265,7 @@ class _Pieces(NamedTuple):
 
 
 def _lumen(image: Image, threshold: float, at_mm: Floats | None) -> Lumen:
-    """Return the connected voxels above the threshold: the piece nearest to the point, or the largest."""
+    """Return connected voxels above the threshold: the piece near a point, else that with a bulge or the largest."""
     above = image.voxels >= threshold
     if above.all():
         raise VesselError(
@@ -277,8 +280,11 @@ def _lumen(image: Image, threshold: float, at_mm: Floats | None) -> Lumen:
             f"range from {image.voxels.min()} to {image.voxels.max()}). Set another threshold (--threshold)."
         )
     pieces = _Pieces(label, size, threshold)
-    chosen = int(size.argmax()) if at_mm is None else _nearest(image, pieces, np.asarray(at_mm, dtype=np.float64))
-    box = _with_margin(ndimage.find_objects(label, max_label=chosen)[chosen - 1], label.shape)
+    if at_mm is None:
+        chosen = bulging(size, lambda k: prominence(label[_box(label, k)] == k, image.spacing_mm))
+    else:
+        chosen = _nearest(image, pieces, np.asarray(at_mm, dtype=np.float64))
+    box = _with_margin(_box(label, chosen), label.shape)
     part = label[box]
     field = image.voxels[box].astype(np.float32)
     below = np.float32(threshold - 0.5 * max(float(field.max()) - threshold, 1e-6))
@@ -286,6 +292,12 @@ def _lumen(image: Image, threshold: float, at_mm: Floats | None) -> Lumen:
     affine = np.array(image.affine_mm)
     affine[:3, 3] = image.to_mm(np.array([[s.start for s in box]]))[0]
     return Lumen(field, affine, threshold, int(size[chosen]), int(size.sum()))
+
+
+def _box(label: NDArray[Any], number: int) -> tuple[slice, ...]:
+    """Return the bounding box of a piece."""
+    found: tuple[slice, ...] = ndimage.find_objects(label, max_label=number)[number - 1]
+    return found
 
 
 def _nearest(image: Image, pieces: _Pieces, at_mm: Floats) -> int:

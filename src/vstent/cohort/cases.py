@@ -11,8 +11,8 @@ from vstent.devices.catalogue import find_design
 from vstent.errors import InputError, ReadError
 from vstent.fields import flag
 from vstent.flow.simulation import check_engine
-from vstent.io.files import IMAGE_SUFFIXES, SURFACE_SUFFIXES, suffix
-from vstent.study.keys import hash_of, measures_key, refuse_missing, study_keys
+from vstent.io.files import IMAGE_SUFFIXES, SURFACE_SUFFIXES, existing, suffix
+from vstent.study.keys import hash_of, measures_key, study_keys
 from vstent.study.settings import OPTIONS, Settings, settings_of
 
 
@@ -55,7 +55,7 @@ def find_cases(cohort: Path, given: Mapping[str, Any]) -> tuple[Case, ...]:
     InputError
         A row of the file cannot be used, or two cases have the same name.
     """
-    refuse_missing(cohort)
+    existing(cohort)
     cases = _in_folder(cohort, settings_of(given)) if cohort.is_dir() else _in_file(cohort, given)
     if not cases:
         raise ReadError(f"{cohort} holds no cases: give a folder of scans or surfaces, or a CSV file of their paths")

@@ -1,31 +1,41 @@
 """Read a DICOM series as an `Image`."""
 
 import logging
+import re
 import struct
 import warnings
 import zlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vstent.errors import ReadError, UnitError
 from vstent.geometry.image import Image
-from vstent.io.files import silenced
+from vstent.io.files import IMAGE_SUFFIXES, SURFACE_SUFFIXES, files_in, suffix
+from vstent.io.limits import refuse_bomb
 from vstent.kernels.arrays import Floats
 from vstent.units import counted
 
-MOST_VOXELS: Final = 1 << 31
-"""Largest number of voxels of a series; a scan of the head has fewer."""
 MOST_UNPACKED: Final = 1 << 29
 """Largest unpacked size of a deflated file, in bytes."""
 SPACING_TOLERANCE: Final = 0.02
 """Largest deviation of a slice from the regular grid, as a fraction of the slice distance."""
+ROUNDED: Final = 0.6
+"""Largest deviation of a rounded number from a fitted line, in units of its last digit."""
+MOST_OVERLAP: Final = 2.5
+"""Largest usual ratio of the thickness of slices to their distance; it is 2 where half of each slice overlaps."""
+SAME: Final = 1e-3
+"""Largest difference of directions of unit length, and of pixel spacings relative to each other, within a series."""
+SKEWED: Final = 0.03
+"""Largest error of the product of two directions of two digits."""
+MOST_ODD: Final = 0.25
+"""Largest fraction of slices that may be called odd ones; more are another stack."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +60,10 @@ class _Slice:
     """Offset added after the factor."""
     padding: tuple[int, int] | None
     """Smallest and largest stored value that mark pixels outside the field of view; None where not stated."""
+    thickness_mm: float
+    """Thickness; 0 where not stated."""
+    rounding_mm: float
+    """Last digit to which the position is written, in mm."""
 
     @property
     def name(self) -> str:
@@ -62,24 +76,72 @@ class _Slice:
         return int(self.dataset.Rows), int(self.dataset.Columns)
 
 
+BARE: Final = re.compile(rb"[\x02\x08]\0.\0([A-Z]{2}|.{2}\0\0)|\0[\x02\x08]\0.[A-Z]{2}", re.DOTALL)
+"""First bytes of a file without preamble: an element of group 2 or 8, with a value of less than 64 kB."""
+DIRECTORY: Final = "1.2.840.10008.1.3.10"
+"""Storage class of a DICOMDIR."""
+
+
 def is_dicom(path: Path) -> bool:
-    """Return whether a file begins like DICOM: the letters DICM after a preamble of 128 bytes."""
+    """Return whether a file begins like DICOM: the letters DICM after 128 bytes, or at once with an element.
+
+    Files without the letters must not have the suffix of another format.
+    """
     if not path.is_file():
         return False
     with path.open("rb") as file:
-        return file.read(132)[128:] == b"DICM"
+        head = file.read(132)
+    may_be_bare = suffix(path) == ".dcm" or suffix(path) not in (*SURFACE_SUFFIXES, *IMAGE_SUFFIXES)
+    return head[128:] == b"DICM" or (may_be_bare and BARE.match(head) is not None)
 
 
-def read_dicom(path: Path, *, acquisition: int | None = None) -> Image:
-    """Read the largest series of a folder, or the series that one file belongs to.
+def is_directory(path: Path) -> bool:
+    """Return whether a file is a DICOMDIR, the list of the files on a medium."""
+    if not is_dicom(path):
+        return False
+    with suppress(*damage()), quiet():
+        return bool(load(path).file_meta.MediaStorageSOPClassUID == DIRECTORY)
+    return False
 
-    Slices are ordered by position, never by name or number. Exact copies of a slice are dropped. Where a series holds
-    several acquisitions of the same slices, such as mask and fill runs, one is read: the requested one, else the one
-    with the brightest vessels. MONOCHROME1 images are inverted.
+
+def load(path: Path, *, with_pixels: bool = False) -> Any:
+    """Return the data set of a DICOM file, also where it has no preamble or no file meta information.
 
     Parameters
     ----------
-    path : a folder, or one file of a series; a multi-frame file is read alone.
+    path : the file.
+    with_pixels : whether the pixel data are read.
+
+    Raises
+    ------
+    Exception
+        One of `damage`.
+    """
+    import pydicom
+
+    dataset = pydicom.dcmread(path, stop_before_pixels=not with_pixels, force=True)
+    meta = dataset.file_meta
+    if "TransferSyntaxUID" not in meta:
+        is_implicit, is_little = dataset.original_encoding
+        explicit = pydicom.uid.ExplicitVRLittleEndian if is_little else pydicom.uid.ExplicitVRBigEndian
+        meta.TransferSyntaxUID = pydicom.uid.ImplicitVRLittleEndian if is_implicit else explicit
+    if "MediaStorageSOPClassUID" not in meta:
+        meta.MediaStorageSOPClassUID = dataset.get("SOPClassUID", pydicom.uid.UID(""))
+    return dataset
+
+
+def read_dicom(path: Path, *, has_spacing: bool = False, acquisition: int | None = None) -> Image:
+    """Read one series of a folder, or the series that one file belongs to.
+
+    Of several series in a folder, original ones precede reformats and projections; the one with most voxels is read.
+    Files that are no slices of a volume are passed over. Slices are ordered by position, never by name or number. Exact
+    copies of a slice are dropped. Where a series holds several acquisitions of the same slices, such as mask and fill
+    runs, one is read: the requested one, else the one with the brightest vessels. MONOCHROME1 images are inverted.
+
+    Parameters
+    ----------
+    path : a folder, its DICOMDIR, or one file of a series; a multi-frame file is read alone.
+    has_spacing : whether the caller replaces the spacing, so that the slices need not state it.
     acquisition : number of the acquisition in a series that holds several, counted from 1.
 
     Returns
@@ -95,16 +157,17 @@ def read_dicom(path: Path, *, acquisition: int | None = None) -> Image:
         The pixel spacing is not stated.
     """
     with quiet():
-        series, notes = _choose(path)
+        series, notes = _choose(path.parent if is_directory(path) else path)
         planes, of_groups = _one_acquisition(
-            [p for file, dataset in series for p in _planes(file, dataset)], acquisition
+            [p for file, dataset in series for p in _planes(file, dataset, has_spacing=has_spacing)], acquisition
         )
         planes, of_copies = _without_copies(planes)
-        slices, affine = _arrange(planes)
+        slices, affine, of_places = _arrange(planes)
         voxels = np.stack([_pixels(plane) for plane in slices], axis=-1)  # (row, column, slice)
         modality = str(getattr(slices[0].dataset, "Modality", ""))
         of_colors = (INVERTED,) if _is_inverted(slices[0]) else ()
-    return Image(voxels.transpose(1, 0, 2), affine, modality, (*notes, *of_groups, *of_copies, *of_colors))
+    notes = (*notes, *of_groups, *of_copies, *of_places, *of_colors)
+    return Image(voxels.transpose(1, 0, 2), affine, modality, notes)
 
 
 INVERTED: Final = "The images are MONOCHROME1 (bright means low): intensities were inverted."
@@ -142,22 +205,118 @@ def damage() -> tuple[type[Exception], ...]:
     return (*plain, ValueError, struct.error, zlib.error, BytesLengthException, InvalidDicomError)
 
 
+class _Series(NamedTuple):
+    """Files that belong together."""
+
+    files: list[tuple[Path, Any]]
+    """Paths and headers."""
+    flaw: str
+    """Reason why it is no volume; empty where it may be one."""
+
+    @property
+    def header(self) -> Any:
+        """Header of the first file."""
+        return self.files[0][1]
+
+    @property
+    def n_slices(self) -> int:
+        """Number of slices."""
+        return sum(int(getattr(dataset, "NumberOfFrames", 1) or 1) for _, dataset in self.files)
+
+    @property
+    def rank(self) -> tuple[bool, bool, bool, bool, int]:
+        """Suitability; the largest is read."""
+        kind = _text(getattr(self.header, "ImageType", None)).upper()
+        is_original = kind.startswith(("ORIGINAL", "NONE"))
+        n_voxels = sum(_n_voxels(dataset) for _, dataset in self.files)
+        is_plain = not _is_reformat(self.header) and not self.is_thick
+        return not self.flaw, self.n_slices >= FEWEST_SLICES, is_plain, is_original, n_voxels
+
+    @property
+    def is_thick(self) -> bool:
+        """Whether slices are much thicker than their distance, as those of a sliding projection."""
+        with suppress(*damage()):
+            across, down = np.reshape(np.array(self.header.ImageOrientationPatient, dtype=np.float64), (2, 3))
+            places = [np.array(one.ImagePositionPatient, dtype=np.float64) for _, one in self.files]
+            steps = np.diff(np.sort(np.stack(places) @ np.cross(across, down)))
+            return float(self.header.SliceThickness) > MOST_OVERLAP * float(np.median(steps))
+        return False
+
+    def __str__(self) -> str:
+        """Return number, description, type and number of slices."""
+        number, title = (getattr(self.header, name, None) for name in ("SeriesNumber", "SeriesDescription"))
+        kind = _text(getattr(self.header, "ImageType", None)).replace("/", "\\")
+        of = f"{self.n_slices} {'images: ' + self.flaw if self.flaw else 'slices'}"
+        return f"{'without number' if number is None else number}{f' {title!r}' if title else ''} ({kind}, {of})"
+
+
+FEWEST_SLICES: Final = 8
+"""Series of fewer slices, such as scouts, are read only where there is no longer one."""
+REFORMATS: Final = ("MIP", "MPR", "MINIP", "MIN IP", "MAX IP", "PROJECTION", "REFORMAT", "LOCALIZER", "SCOUT", "VRT")
+"""Words in the image type or the description of a series that was computed from another one, or shows where it lies."""
+
+
+def _is_reformat(dataset: Any) -> bool:
+    """Return whether an image is a reformat, projection or scout of another series."""
+    words = _text(getattr(dataset, "ImageType", None)), str(getattr(dataset, "SeriesDescription", ""))
+    return re.search(rf"\b({'|'.join(REFORMATS)})", " ".join(words).upper().replace("_", " ")) is not None
+
+
+def _flaw(dataset: Any) -> str:
+    """Return why an image is no slice of a volume; empty where it may be one."""
+    if getattr(dataset, "Modality", "") == "SEG":
+        return "segmentation"
+    if int(getattr(dataset, "SamplesPerPixel", 1) or 1) > 1:
+        return "colors"
+    n_frames = int(getattr(dataset, "NumberOfFrames", 1) or 1)
+    frames = getattr(dataset, "PerFrameFunctionalGroupsSequence", None)
+    if n_frames > 1 and not frames:
+        return "projections"
+    places = [dataset, *([frames[0]] if frames else []), *getattr(dataset, "SharedFunctionalGroupsSequence", [])]
+    is_placed = all(_value(places, name) is not None for name in ("ImagePositionPatient", "ImageOrientationPatient"))
+    return "" if is_placed else "no position in the patient"
+
+
 def _choose(path: Path) -> tuple[list[tuple[Path, Any]], tuple[str, ...]]:
-    """Return the files of one series (the one with most voxels, or that of the file given) and notes."""
-    found: dict[str, list[tuple[Path, Any]]] = {}
+    """Return the files of one series (that of the file given, or the most suitable one) and notes."""
+    found: dict[tuple[str, bool, bool], list[tuple[Path, Any]]] = {}
     for file, dataset in _headers(path):
         if dataset is not None:
-            found.setdefault(str(getattr(dataset, "SeriesInstanceUID", "")), []).append((file, dataset))
-    wanted = [key for key, files in found.items() if path.is_dir() or any(file == path for file, _ in files)]
+            # A series may hold scouts, projections and captures of the screen beside its slices.
+            key = str(getattr(dataset, "SeriesInstanceUID", "")), _is_reformat(dataset), _flaw(dataset) == "colors"
+            found.setdefault(key, []).append((file, dataset))
+    flaws = {key: {_flaw(dataset) for _, dataset in files} for key, files in found.items()}
+    every = [_Series(files, "" if "" in flaws[key] else min(flaws[key])) for key, files in found.items()]
+    wanted = [one for one in every if path.is_dir() or any(file == path for file, _ in one.files)]
     if not wanted:
         raise ReadError(f"{path} holds no DICOM images. Check the path, or export the series again.")
-    uid = max(wanted, key=lambda key: sum(_n_voxels(dataset) for _, dataset in found[key]))
-    if (n_voxels := sum(_n_voxels(dataset) for _, dataset in found[uid])) > MOST_VOXELS:
-        raise ReadError(
-            f"{path} states {n_voxels / 1e9:.3g} billion voxels, more than a scan of the head. Export it again."
-        )
-    note = f"{len(found)} DICOM series found; the largest, of {len(found[uid])} files, is used."
-    return found[uid], (note,) if len(found) > 1 and path.is_dir() else ()
+    chosen = max(wanted, key=lambda one: one.rank)
+    _refuse_flaw(chosen)
+    n_bytes = sum(_n_voxels(one) * int(getattr(one, "BitsAllocated", 16)) // 8 for _, one in chosen.files)
+    refuse_bomb(f"{path} states {counted(chosen.n_slices, 'slice')}", n_bytes, _size(file for file, _ in chosen.files))
+    if len(every) < 2 or not path.is_dir():
+        return chosen.files, ()
+    others = "; ".join(str(one) for one in every if one is not chosen)
+    return chosen.files, (
+        f"{len(every)} DICOM series found. Series {chosen} is used; others: {others}. To use another one, give one of "
+        "its files.",
+    )
+
+
+def _refuse_flaw(series: _Series) -> None:
+    """Raise ReadError where the best series is no volume."""
+    name = series.files[0][0].name
+    if series.flaw == "segmentation":
+        raise ReadError(f"{name} is a DICOM segmentation, which vstent does not read. Export it as NIfTI or NRRD.")
+    if series.flaw == "colors":
+        raise ReadError(f"{name} is an image in colors, not a slice of a scan. Export the 3-D reconstruction.")
+    if series.flaw == "projections":
+        raise ReadError(f"{name} is a series of projections, not a volume. Export the 3-D reconstruction.")
+
+
+def _size(files: Iterable[Path]) -> int:
+    """Return the size of files in bytes."""
+    return sum(file.stat().st_size for file in files)
 
 
 def _headers(path: Path) -> Iterator[tuple[Path, Any]]:
@@ -167,7 +326,7 @@ def _headers(path: Path) -> Iterator[tuple[Path, Any]]:
     belongs to this one, its slice is reported as missing later.
     """
     if path.is_dir():
-        yield from ((file, _header(file)) for file in _candidates(path))
+        yield from ((file, _header(file)) for file in candidates(path))
         return
     own = _header(path)
     yield path, own
@@ -178,15 +337,23 @@ def _headers(path: Path) -> Iterator[tuple[Path, Any]]:
             yield file, _header(file)
 
 
-def _candidates(folder: Path) -> list[Path]:
-    """Return all DICOM files below a folder; raise ReadError for a damaged one, whose slice would be missing."""
-    files = sorted(p for p in folder.rglob("*") if not p.name.startswith("."))
-    for file in files:
-        if file.suffix.lower() == ".dcm" and not file.is_dir() and not is_dicom(file):
+def candidates(path: Path) -> list[Path]:
+    """Return the DICOM files below a folder, or below that of a DICOMDIR, without folders of results.
+
+    Raises
+    ------
+    ReadError
+        A file has the suffix of DICOM but not its content: its slice would be missing.
+    """
+    found = []
+    for file in files_in(path if path.is_dir() else path.parent):
+        if is_dicom(file):
+            found.append(file)
+        elif file.suffix.lower() == ".dcm":
             raise ReadError(
                 f"{file.name} is not a DICOM file, or its beginning is damaged. Copy it again, or remove it."
             )
-    return [file for file in files if is_dicom(file)]
+    return found
 
 
 def _siblings(path: Path) -> list[Path]:
@@ -196,15 +363,13 @@ def _siblings(path: Path) -> list[Path]:
 
 def _header(file: Path) -> Any:
     """Return the header of an image file; None for DICOM files that are not images."""
-    import pydicom
-
     try:
         _refuse_bomb(file)
-        dataset = pydicom.dcmread(file, stop_before_pixels=True)
+        dataset = load(file)
         is_image = "Image Storage" in dataset.file_meta.MediaStorageSOPClassUID.name
         if not is_image and "Rows" not in dataset:
             return None
-        _ = dataset.SeriesInstanceUID, _n_voxels(dataset)  # faults are raised when values are first used
+        _ = dataset.SeriesInstanceUID, _n_voxels(dataset), _flaw(dataset)  # faults are raised at the first use
         return dataset
     except damage():
         raise ReadError(
@@ -217,6 +382,9 @@ def _refuse_bomb(file: Path) -> None:
     from pydicom.filereader import read_file_meta_info
     from pydicom.uid import DeflatedExplicitVRLittleEndian
 
+    with file.open("rb") as stream:
+        if stream.read(132)[128:] != b"DICM":
+            return  # without this beginning, a file does not state that it is deflated
     meta = read_file_meta_info(file)
     if meta.get("TransferSyntaxUID") != DeflatedExplicitVRLittleEndian:
         return
@@ -234,31 +402,33 @@ def _n_voxels(dataset: Any) -> int:
     return int(dataset.Rows) * int(dataset.Columns) * int(getattr(dataset, "NumberOfFrames", 1) or 1)
 
 
-def _planes(file: Path, dataset: Any) -> list[_Slice]:
+def _planes(file: Path, dataset: Any, *, has_spacing: bool) -> list[_Slice]:
     """Return the slices of one file: itself, or its frames."""
     try:
-        return _frames(file, dataset)
+        return _frames(file, dataset, has_spacing=has_spacing)
     except damage():
         raise ReadError(
             f"{file.name} is damaged: its position, orientation or pixel spacing cannot be read. Export it again."
         ) from None
 
 
-def _frames(file: Path, dataset: Any) -> list[_Slice]:
+def _frames(file: Path, dataset: Any, *, has_spacing: bool) -> list[_Slice]:
     """Return the slices of one file; ReadError is raised for a series of projections."""
     if "PerFrameFunctionalGroupsSequence" not in dataset:
         if int(getattr(dataset, "NumberOfFrames", 1) or 1) > 1:
             raise ReadError(f"{file.name} is a series of projections, not a volume. Export the 3-D reconstruction.")
-        return [_plane(file, dataset, None, [dataset])]
+        return [_plane(file, dataset, None, [dataset], has_spacing=has_spacing)]
     shared = list(getattr(dataset, "SharedFunctionalGroupsSequence", []))
     frames = dataset.PerFrameFunctionalGroupsSequence
-    return [_plane(file, dataset, k, [frame, *shared, dataset]) for k, frame in enumerate(frames)]
+    places = [[frame, *shared, dataset] for frame in frames]
+    return [_plane(file, dataset, k, place, has_spacing=has_spacing) for k, place in enumerate(places)]
 
 
 _GROUP: Final = {
     "ImagePositionPatient": "PlanePositionSequence",
     "ImageOrientationPatient": "PlaneOrientationSequence",
     "PixelSpacing": "PixelMeasuresSequence",
+    "SliceThickness": "PixelMeasuresSequence",
     "RescaleSlope": "PixelValueTransformationSequence",
     "RescaleIntercept": "PixelValueTransformationSequence",
 }
@@ -275,7 +445,7 @@ def _value(places: list[Any], keyword: str) -> Any:
     return None
 
 
-def _plane(file: Path, dataset: Any, frame: int | None, places: list[Any]) -> _Slice:
+def _plane(file: Path, dataset: Any, frame: int | None, places: list[Any], *, has_spacing: bool) -> _Slice:
     """Return one slice with its position, orientation, spacing and scaling."""
     name = file.name if frame is None else f"{file.name} frame {frame + 1}"
     position, orientation = _value(places, "ImagePositionPatient"), _value(places, "ImageOrientationPatient")
@@ -284,19 +454,27 @@ def _plane(file: Path, dataset: Any, frame: int | None, places: list[Any]) -> _S
         raise ReadError(
             f"Slice {name} does not state its position in the patient. Export the 3-D reconstruction as DICOM."
         )
-    if pixel is None:
-        raise UnitError(f"Slice {name} does not state its pixel spacing. Export it again with PixelSpacing.")
+    if pixel is None and not has_spacing:
+        raise UnitError(f"Slice {name} does not state its pixel spacing; give --spacing in mm.")
     return _Slice(
         dataset,
         file,
         frame,
         np.asarray(position, dtype=np.float64).reshape(3),
         np.asarray(orientation, dtype=np.float64).reshape(2, 3),
-        np.asarray(pixel, dtype=np.float64).reshape(2)[::-1],
+        np.asarray([1.0, 1.0] if pixel is None else pixel, dtype=np.float64).reshape(2)[::-1],
         float(_value(places, "RescaleSlope") or 1.0),
         float(_value(places, "RescaleIntercept") or 0.0),
         _padding(dataset),
+        float(_value(places, "SliceThickness") or 0.0),
+        _rounding_mm(position),
     )
+
+
+def _rounding_mm(position: Any) -> float:
+    """Return the last digit to which a position is written, in mm."""
+    words = [str(getattr(value, "original_string", value)).strip() for value in position]
+    return float(min(10.0 ** -len(word.partition(".")[2]) if "e" not in word.lower() else 0.0 for word in words))
 
 
 def _padding(dataset: Any) -> tuple[int, int] | None:
@@ -415,52 +593,89 @@ def _without_copies(planes: list[_Slice]) -> tuple[list[_Slice], tuple[str, ...]
 # -- geometry ----------------------------------------------------------------------------------------------------------
 
 
-def _arrange(slices: list[_Slice]) -> tuple[list[_Slice], Floats]:
-    """Return slices sorted along their normal, and the affine from (column, row, slice) to LPS mm."""
+def _arrange(slices: list[_Slice]) -> tuple[list[_Slice], Floats, tuple[str, ...]]:
+    """Return slices sorted along their normal, the affine from (column, row, slice) to LPS mm, and notes."""
     if len(slices) < 2:
         raise ReadError(
             f"Slice {slices[0].name} is alone, and one slice is not a volume. Give the folder of the whole series."
         )
-    _refuse_odd(slices)
-    across, down = slices[0].orientation
+    across, down = _common_directions(slices)
     normal = np.cross(across, down)
     height = np.array([plane.position_mm @ normal for plane in slices])
     order = np.argsort(height, kind="stable")
     slices = [slices[i] for i in order]
-    _refuse_gaps(slices, height[order])
     position = np.array([plane.position_mm for plane in slices])
     step = (position[-1] - position[0]) / (len(slices) - 1)
-    _refuse_offsets(
-        slices, position - position[0] - np.arange(len(slices))[:, None] * step, float(np.linalg.norm(step))
-    )
+    step_mm, rounding_mm = float(np.linalg.norm(step)), min(plane.rounding_mm for plane in slices)
+    notes = _overlap_note(slices[0], step_mm)
+    try:
+        _refuse_gaps(slices, height[order])
+        _refuse_offsets(slices, position - position[0] - np.arange(len(slices))[:, None] * step, step_mm)
+    except ReadError:
+        if not _fits_rounded(position, rounding_mm):
+            raise
+        rounded = f"The slice positions are rounded to {rounding_mm:g} mm"
+        notes = (*notes, f"{rounded}: an even distance of {step_mm:.4g} mm is used.")
     affine = np.eye(4)
     affine[:3, 0] = across * slices[0].pixel_mm[0]
     affine[:3, 1] = down * slices[0].pixel_mm[1]
     affine[:3, 2] = step
     affine[:3, 3] = position[0]
-    return slices, affine
+    return slices, affine, notes
 
 
-def _refuse_odd(slices: list[_Slice]) -> None:
-    """Raise ReadError where a slice differs in size, pixel spacing or orientation from the majority."""
-    for what, values in (
-        ("size", [plane.size for plane in slices]),
-        ("pixel spacing", [tuple(np.round(plane.pixel_mm, 5)) for plane in slices]),
-        ("orientation", [tuple(np.round(plane.orientation.ravel(), 4) + 0.0) for plane in slices]),
-    ):
-        usual = Counter(values).most_common(1)[0][0]
-        odd = [plane.name for plane, value in zip(slices, values, strict=True) if value != usual]
-        if odd:
-            raise ReadError(
-                f"Slice {odd[0]} has another {what} than the rest of its series ({len(odd)} such). Remove it."
-            )
-    across, down = slices[0].orientation
-    if not all(np.isfinite([*p.position_mm, *p.orientation.ravel(), *p.pixel_mm]).all() for p in slices):
+def _fits_rounded(position_mm: Floats, rounding_mm: float) -> bool:
+    """Return whether positions (n, 3) are evenly spaced on a line but for the rounding of their digits."""
+    number = np.arange(len(position_mm), dtype=np.float64)
+    design = np.stack([np.ones_like(number), number], axis=1)
+    line = np.linalg.lstsq(design, position_mm)[0]
+    step_mm = float(np.linalg.norm(line[1]))
+    # The deviation of a missing slice is at least a quarter of the slice distance.
+    most_mm = min(ROUNDED * rounding_mm + SPACING_TOLERANCE * step_mm, 0.24 * step_mm)
+    return bool(np.abs(position_mm - design @ line).max() <= most_mm)
+
+
+def _overlap_note(plane: _Slice, step_mm: float) -> tuple[str, ...]:
+    """Return a note on slices that are much thicker than the distance between them."""
+    if plane.thickness_mm <= MOST_OVERLAP * step_mm:
+        return ()
+    return (
+        f"The slices are {plane.thickness_mm:.3g} mm thick and {step_mm:.3g} mm apart: they are averages or "
+        "projections, in which vessels and sac are wider. Use the original series.",
+    )
+
+
+def _common_directions(slices: list[_Slice]) -> Floats:
+    """Return the directions (2, 3) of rows and columns; ReadError is raised where a slice differs from the others."""
+    tilt, pixel = (np.array([getattr(p, name).ravel() for p in slices]) for name in ("orientation", "pixel_mm"))
+    if not np.isfinite(np.concatenate([tilt, pixel, [p.position_mm for p in slices]], axis=1)).all():
         raise ReadError(
             "A slice has a position, orientation or pixel spacing that is not a number. Export the series again."
         )
-    if abs(across @ across - 1) > 1e-3 or abs(down @ down - 1) > 1e-3 or abs(across @ down) > 1e-3:
+    usual = Counter(plane.size for plane in slices).most_common(1)[0][0]
+    for what, is_odd in (
+        ("size", np.array([plane.size != usual for plane in slices])),
+        ("pixel spacing", (np.abs(pixel - np.median(pixel, axis=0)) > SAME * np.median(pixel, axis=0)).any(axis=1)),
+        ("orientation", (np.abs(tilt - np.median(tilt, axis=0)) > SAME).any(axis=1)),
+    ):
+        if is_odd.sum() > MOST_ODD * len(slices):
+            raise ReadError(
+                f"{is_odd.sum()} of {len(slices)} slices have another {what} than the others: the series holds several "
+                "stacks. Export one of them as a series of its own."
+            )
+        if is_odd.any():
+            raise ReadError(
+                f"Slice {slices[int(is_odd.argmax())].name} has another {what} than the rest of its series "
+                f"({is_odd.sum()} such). Remove it."
+            )
+    across, down = np.median(tilt, axis=0).reshape(2, 3)
+    skew = max(abs(across @ across - 1), abs(down @ down - 1), abs(across @ down))
+    if skew > SKEWED:
         raise ReadError(f"Slice {slices[0].name} has rows and columns that are not perpendicular. Export it again.")
+    if skew > 1e-3:  # directions of two or three digits
+        left, _, right = np.linalg.svd(np.stack([across, down]), full_matrices=False)
+        return np.asarray(left @ right)
+    return np.stack([across, down])
 
 
 def _refuse_gaps(slices: list[_Slice], height: Floats) -> None:
@@ -479,10 +694,11 @@ def _refuse_gaps(slices: list[_Slice], height: Floats) -> None:
                 f"{missing} slice{'s are' if missing > 1 else ' is'} missing between {before} and {after} "
                 f"({height[i]:.3f} to {height[i + 1]:.3f} mm, elsewhere {usual:.3f} mm apart). Export the series again."
             )
+    for i, step in enumerate(steps):  # a missing slice is the better reason where both are found
         if abs(step - usual) > SPACING_TOLERANCE * usual:
             raise ReadError(
-                f"Slice {after} is {step:.3f} mm from {before}, but slices are {usual:.3f} mm apart elsewhere. "
-                "Export the series with equal distances."
+                f"Slice {slices[i + 1].name} is {step:.3f} mm from {slices[i].name}, but slices are {usual:.3f} mm "
+                "apart elsewhere. Export the series with equal distances."
             )
 
 
@@ -546,7 +762,7 @@ def _inverted(stored: NDArray[Any], dataset: Any) -> NDArray[Any]:
 def _decoded(plane: _Slice) -> NDArray[Any]:
     """Return the stored values (rows, columns) of one slice."""
     try:
-        if "PixelData" not in plane.dataset:
+        if not any(keyword in plane.dataset for keyword in PIXELS):
             _load_pixels(plane)
         array = plane.dataset.pixel_array
     except damage():
@@ -554,12 +770,14 @@ def _decoded(plane: _Slice) -> NDArray[Any]:
     return array if plane.frame is None or array.ndim == 2 else array[plane.frame]
 
 
+PIXELS: Final = ("PixelData", "FloatPixelData", "DoubleFloatPixelData")
+"""Elements that hold pixels."""
+
+
 def _load_pixels(plane: _Slice) -> None:
     """Add the pixel data to the header of a slice."""
-    import pydicom
-
-    full = pydicom.dcmread(plane.path)
-    for keyword in ("PixelData", "FloatPixelData", "DoubleFloatPixelData"):
+    full = load(plane.path, with_pixels=True)
+    for keyword in PIXELS:
         if keyword in full:
             plane.dataset[keyword] = full[keyword]
     plane.dataset.file_meta = full.file_meta
@@ -570,8 +788,7 @@ def _decoded_by_gdcm(plane: _Slice) -> NDArray[Any]:
     import SimpleITK
 
     try:
-        with silenced():
-            scan = SimpleITK.ReadImage(str(plane.path))
+        scan = SimpleITK.ReadImage(str(plane.path))
     except RuntimeError:
         raise ReadError(
             f"The pixels of slice {plane.name} are damaged or in a format that is not supported. "

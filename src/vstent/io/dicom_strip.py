@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from vstent.errors import ReadError
-from vstent.io.dicom import damage, quiet
+from vstent.io.dicom import damage, is_directory, load, quiet
 from vstent.io.files import atomic
 
 KEPT: Final = frozenset(
@@ -14,7 +14,7 @@ KEPT: Final = frozenset(
     PhotometricInterpretation PlanarConfiguration RescaleSlope RescaleIntercept SharedFunctionalGroupsSequence
     PerFrameFunctionalGroupsSequence PlanePositionSequence PlaneOrientationSequence PixelMeasuresSequence
     PixelValueTransformationSequence PixelPaddingValue PixelPaddingRangeLimit AcquisitionNumber
-    TemporalPositionIdentifier TriggerTime EchoTime PixelData FloatPixelData DoubleFloatPixelData
+    ImageType SeriesNumber TemporalPositionIdentifier TriggerTime EchoTime PixelData FloatPixelData DoubleFloatPixelData
     """.split()
 )
 """Elements needed to read a volume; none identifies the patient."""
@@ -23,7 +23,7 @@ RENAMED: Final = ("SeriesInstanceUID", "SOPInstanceUID")
 
 
 def strip_dicom(path: Path, out: Path) -> None:
-    """Write a copy of a DICOM file with only the elements needed to read its voxels.
+    """Write a copy of a DICOM file with only the elements needed to read its voxels; none of a DICOMDIR.
 
     Parameters
     ----------
@@ -37,9 +37,11 @@ def strip_dicom(path: Path, out: Path) -> None:
     """
     import pydicom
 
+    if is_directory(path):
+        return
     try:
         with quiet():
-            given = pydicom.dcmread(path)
+            given = load(path, with_pixels=True)
             kept = _kept(given)
             for name in RENAMED:
                 if name in given:

@@ -1,10 +1,13 @@
-"""File kinds by suffix, and writing that leaves no half-written files."""
+"""File kinds, folders of files, and writing that leaves no half-written files."""
 
+import gzip
 import os
+import re
 import secrets
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from io import BufferedIOBase
 from pathlib import Path
 from typing import Final
 
@@ -18,6 +21,10 @@ RAW_SUFFIXES: Final = (".raw", ".raw.gz")
 """Suffixes of voxels without a header; their number and spacing must be given."""
 IMAGE_SUFFIXES: Final = (*NIFTI_SUFFIXES, ".nrrd", ".nhdr", ".mha", ".mhd", ".vti", *RAW_SUFFIXES, ".dcm")
 """Suffixes of scans."""
+CACHE: Final = ".vstent"
+"""Subfolder by which a folder of results is recognized; it holds the finished stages."""
+_VTK_IMAGE: Final = re.compile(rb"^\s*DATASET\s+(STRUCTURED_POINTS|RECTILINEAR_GRID)", re.I | re.M)
+"""Line of a legacy VTK file that holds an image."""
 PARTIAL: Final = ".partial-"
 """Prefix of the name of a file that is being written; the process number follows."""
 _ONE_AT_A_TIME: Final = threading.RLock()
@@ -25,8 +32,16 @@ _ONE_AT_A_TIME: Final = threading.RLock()
 
 
 def is_surface_file(path: Path) -> bool:
-    """Return whether a path has the suffix of a surface file."""
-    return suffix(path) in SURFACE_SUFFIXES
+    """Return whether a path has the suffix of a surface file, and is no image in legacy VTK format."""
+    return suffix(path) in SURFACE_SUFFIXES and not is_vtk_image(path)
+
+
+def is_vtk_image(path: Path) -> bool:
+    """Return whether a file is an image in legacy VTK format (``.vtk``), which may hold a surface too."""
+    if suffix(path) != ".vtk" or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return _VTK_IMAGE.search(file.read(4096)) is not None
 
 
 def suffix(path: Path) -> str:
@@ -41,12 +56,33 @@ def existing(path: Path) -> Path:
     Raises
     ------
     ReadError
-        The path does not exist.
+        The path does not exist, or is something else, such as a named pipe, on which reading would wait forever.
     """
     path = Path(path)
     if not path.exists():
         raise ReadError(f"{path} does not exist: check the path.")
+    if not (path.is_file() or path.is_dir()):
+        raise ReadError(f"{path} is neither a file nor a folder. Give a scan or a surface.")
     return path
+
+
+def files_in(folder: Path) -> list[Path]:
+    """Return the files below a folder, sorted, without hidden ones and without those of folders of results."""
+    found: list[Path] = []
+    for place, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if name[0] != "." and not Path(place, name, CACHE).is_dir()]
+        found += [Path(place, name) for name in names if name[0] != "."]
+    return sorted(found)
+
+
+@contextmanager
+def unpacked(path: Path) -> Iterator[BufferedIOBase]:
+    """Open a file for reading; where it begins like a gzip file, its unpacked content is read, whatever its name."""
+    with path.open("rb") as file:
+        is_packed = file.read(2) == b"\x1f\x8b"
+        file.seek(0)
+        with gzip.open(file) if is_packed else file as content:
+            yield content
 
 
 @contextmanager

@@ -1,28 +1,26 @@
 """Read NIfTI-1 and NIfTI-2 files as an `Image`, with nibabel."""
 
-import gzip
 import math
 import zlib
-from contextlib import contextmanager
+from io import BufferedIOBase
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vstent.errors import ReadError, UnitError
 from vstent.geometry.image import Image
-from vstent.io.files import suffix
+from vstent.io.files import unpacked
+from vstent.io.limits import MOST_BYTES, MOST_PACKED, refuse_bomb
 from vstent.kernels.arrays import Floats
 
 HEADER_BYTES: Final = {348: "NIfTI-1", 540: "NIfTI-2"}
 """Size of the header in bytes, which is also its first number, and the version with that size."""
-MOST_BYTES: Final = 1 << 32
-"""Largest scan that is read, in bytes; a scan of the head is smaller."""
-MOST_PACKED: Final = 1032
-"""Largest compression ratio that gzip reaches."""
-MM_PER_UNIT: Final = {"meter": 1e3, "mm": 1.0, "micron": 1e-3, "unknown": 1.0}
-"""Length units of a NIfTI header in mm."""
+MM_PER_UNIT: Final = {0: 1.0, 1: 1e3, 2: 1.0, 3: 1e-3}
+"""Length in mm of the units of a NIfTI header, by their code; 0 states none, and is mm."""
+ROUNDED: Final = 1e-7
+"""Square of the scalar part of a quaternion up to which it is 0 but for rounding."""
 RAS_TO_LPS: Final = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Matrix that converts RAS coordinates to LPS."""
 
@@ -35,7 +33,7 @@ def read_nifti(path: Path, *, has_spacing: bool) -> Image:
 
     Parameters
     ----------
-    path : the file, ``.nii`` or ``.nii.gz``.
+    path : the file; its first bytes say whether it is compressed.
     has_spacing : whether the caller replaces the spacing, so that the header need not state it.
 
     Returns
@@ -57,14 +55,12 @@ def read_nifti(path: Path, *, has_spacing: bool) -> Image:
     if not has_spacing and not (np.isfinite(spacing).all() and (spacing > 0).all()):
         raise UnitError(f"{path.name} does not state a voxel spacing above zero; give --spacing in mm.")
     spacing = np.where(np.isfinite(spacing) & (spacing > 0), spacing, 1.0)
-    return Image(_scaled(_stored(header, shape, path), header), _affine_mm(header, spacing), notes=())
-
-
-@contextmanager
-def _opened(path: Path) -> Any:
-    """Open a file, unpacked where it is compressed."""
-    with gzip.open(path) if suffix(path) == ".nii.gz" else path.open("rb") as file:
-        yield file
+    code = int(header["xyzt_units"]) % 8
+    if code not in MM_PER_UNIT and not has_spacing:
+        raise UnitError(f"{path.name} has the length unit {code}, which NIfTI does not define. Give --spacing in mm.")
+    affine, notes = _affine(header, shape, spacing)
+    to_mm = np.diag([*[MM_PER_UNIT.get(code, 1.0)] * 3, 1.0])
+    return Image(_scaled(_stored(header, shape, path), header), to_mm @ affine, notes=notes)
 
 
 def _header(path: Path) -> Any:
@@ -75,7 +71,7 @@ def _header(path: Path) -> Any:
     from nibabel.wrapstruct import WrapStructError
 
     try:
-        with _opened(path) as file:
+        with unpacked(path) as file:
             head = file.read(max(HEADER_BYTES))
     except (OSError, EOFError, zlib.error):
         raise ReadError(f"{path.name} is damaged: it ends within its header. Copy or export it again.") from None
@@ -135,16 +131,16 @@ def _begin(header: Any, path: Path) -> int:
 def _check_length(header: Any, shape: tuple[int, int, int], path: Path) -> None:
     """Raise ReadError where the file is shorter than its header states, before memory is allocated."""
     n_bytes = math.prod(shape) * _kind(header, path).itemsize
-    stated = f"{path.name} states {' x '.join(map(str, shape))} voxels, {n_bytes / 1e9:.3g} GB"
+    announced = f"{path.name} states {' x '.join(map(str, shape))} voxels"
     if n_bytes > MOST_PACKED * path.stat().st_size:
         raise ReadError(
-            f"{stated}, but has {path.stat().st_size} bytes: it is damaged and breaks off. Copy or export it again."
+            f"{announced}, {n_bytes / 1e9:.3g} GB, but has {path.stat().st_size} bytes: it is damaged and breaks off. "
+            "Copy or export it again."
         )
-    if n_bytes > MOST_BYTES:
-        raise ReadError(f"{stated}, which is more than a scan of the head. Export the part around the aneurysm.")
+    refuse_bomb(announced, n_bytes, path.stat().st_size)
     needed, length = _begin(header, path) + n_bytes, 0
     try:
-        with _opened(path) as file:
+        with unpacked(path) as file:
             while length < needed and (part := file.read(1 << 22)):
                 length += len(part)
     except (OSError, EOFError, zlib.error):
@@ -156,14 +152,14 @@ def _check_length(header: Any, shape: tuple[int, int, int], path: Path) -> None:
 def _stored(header: Any, shape: tuple[int, int, int], path: Path) -> NDArray[Any]:
     """Return the voxels (i, j, k) as stored."""
     kind = _kind(header, path)
-    with _opened(path) as file:
+    with unpacked(path) as file:
         _skip(file, _begin(header, path))
         data = file.read(math.prod(shape) * kind.itemsize)
     voxels = np.frombuffer(data, kind).reshape(shape, order="F")
     return voxels.astype(kind.newbyteorder("="), copy=False)
 
 
-def _skip(file: IO[bytes], n_bytes: int) -> None:
+def _skip(file: BufferedIOBase, n_bytes: int) -> None:
     """Read and discard bytes."""
     while n_bytes > 0 and (part := file.read(min(n_bytes, 1 << 22))):
         n_bytes -= len(part)
@@ -178,11 +174,48 @@ def _scaled(stored: NDArray[Any], header: Any) -> NDArray[Any]:
     return (stored * slope + intercept).astype(np.float32)
 
 
-def _affine_mm(header: Any, spacing: Floats) -> Floats:
-    """Return the affine (4, 4) from voxel to LPS mm."""
-    to_mm = np.diag([*[MM_PER_UNIT.get(header.get_xyzt_units()[0], 1.0)] * 3, 1.0])
-    sform, qform = header.get_sform(coded=True), header.get_qform(coded=True)
-    for affine, code in (sform, qform):
-        if code and affine is not None and np.isfinite(affine).all() and np.linalg.det(affine[:3, :3]) != 0:
-            return np.asarray(RAS_TO_LPS @ to_mm @ affine)
-    return np.asarray(to_mm @ np.diag([*spacing, 1.0]))
+def _affine(header: Any, shape: tuple[int, int, int], spacing: Floats) -> tuple[Floats, tuple[str, ...]]:
+    """Return the affine (4, 4) from voxel to LPS in the unit of the file, and a note where its two frames differ."""
+    sform, qform = (one if _is_frame(one) else None for one in (_sform(header), _qform(header, spacing)))
+    if sform is None or qform is None:
+        frame = qform if sform is None else sform
+        return np.diag([*spacing, 1.0]) if frame is None else RAS_TO_LPS @ frame, ()
+    corners = np.array(np.meshgrid(*[[0, n - 1] for n in shape])).reshape(3, -1)
+    apart = np.linalg.norm((sform - qform)[:3, :3] @ corners + (sform - qform)[:3, 3:], axis=0).max()
+    is_mirrored = np.linalg.det(sform[:3, :3]) * np.linalg.det(qform[:3, :3]) < 0
+    how = "mirror each other: check left and right" if is_mirrored else f"differ by {apart / spacing.min():.0f} voxels"
+    note = f"The two frames of the file (sform and qform) {how}. The sform is used."
+    return RAS_TO_LPS @ sform, (note,) if is_mirrored or apart > spacing.min() else ()
+
+
+def _is_frame(affine: Floats | None) -> bool:
+    """Return whether an affine (4, 4) is finite and has three independent axes."""
+    return affine is not None and bool(np.isfinite(affine).all()) and np.linalg.det(affine[:3, :3]) != 0
+
+
+def _sform(header: Any) -> Floats | None:
+    """Return the affine (4, 4) that the header states by its rows; None where it states none."""
+    rows = np.stack([header[name] for name in ("srow_x", "srow_y", "srow_z")]).astype(np.float64)
+    return np.concatenate([rows, [[0, 0, 0, 1]]]) if int(header["sform_code"]) > 0 else None
+
+
+def _qform(header: Any, spacing: Floats) -> Floats | None:
+    """Return the affine (4, 4) that the header states by a quaternion; None where it states none.
+
+    As in the reference implementation of NIfTI (nifti1_io.c), a quaternion longer than 1 is scaled to 1, and a sign of
+    0 stands for 1.
+    """
+    from nibabel.quaternions import quat2mat
+
+    vector = np.array([header[f"quatern_{axis}"] for axis in "bcd"], dtype=np.float64)
+    if int(header["qform_code"]) <= 0 or not np.isfinite(vector).all():
+        return None
+    rest = 1.0 - vector @ vector
+    affine = np.eye(4)
+    affine[:3, :3] = (
+        quat2mat([np.sqrt(rest) if rest > ROUNDED else 0.0, *vector])
+        * spacing
+        * [1, 1, -1 if header["pixdim"][0] < 0 else 1]
+    )
+    affine[:3, 3] = [header[f"qoffset_{axis}"] for axis in "xyz"]
+    return affine

@@ -9,9 +9,9 @@ import numpy as np
 
 from vstent.errors import ReadError, UnitError
 from vstent.geometry.surface import Surface
+from vstent.io.apart import read_apart
 from vstent.io.double_wall import inner_wall
-from vstent.io.files import SURFACE_SUFFIXES, existing, suffix
-from vstent.io.vtk_child import read_apart
+from vstent.io.files import SURFACE_SUFFIXES, existing, is_vtk_image, suffix
 from vstent.kernels import topology, triangles
 from vstent.units import MM_PER
 
@@ -67,7 +67,7 @@ def read_surface(
     if units is not None and units not in get_args(Unit):
         raise UnitError(f"Unit {units} is not known: give m, cm or mm.")
     surface, notes = _in_lps(surface, frame, stated)
-    inner = inner_wall(surface)
+    inner = inner_wall(_joined(surface))
     if inner is not None:
         surface, notes = inner, (*notes, "The file holds an inner and an outer wall: the inner one is used.")
     size, diameter = _diagonal(surface), hydraulic_diameter(surface)
@@ -104,15 +104,13 @@ def _read(path: Path) -> tuple[Surface, str]:
         )
     if path.is_dir() or path.stat().st_size == 0:
         raise ReadError(f"{path.name} is {'a folder' if path.is_dir() else 'empty'}, not a surface file.")
+    if is_vtk_image(path):
+        raise ReadError(f"{path.name} is a scan, not a surface. Read it with vstent.read_image.")
     _refuse_mislabelled(path, kind)
-    mesh = None if kind == ".stl" and _is_torn_text(path) else read_apart(path)
-    if mesh is None or len(mesh[1]) == 0:
-        raise ReadError(
-            f"{path.name} holds no surface, or fewer triangles than it states: it is empty, damaged or not a {kind} "
-            "file. Copy or export it again."
-        )
-    vertices, faces, stated = mesh
-    return Surface(vertices, faces), stated or _stated_frame(path, kind)
+    if kind == ".stl" and _is_torn_text(path):
+        raise ReadError(f"{path.name} holds fewer triangles than it states: it breaks off. Copy or export it again.")
+    with read_apart("mesh", path, {}, [path]) as (arrays, words):
+        return Surface(arrays["vertices"], arrays["faces"]), words["space"] or _stated_frame(path, kind)
 
 
 SPACE: Final = re.compile(rb"SPACE\s*[=:]\s*(RAS|LPS)", re.IGNORECASE)
@@ -193,6 +191,14 @@ def _checked(surface: Surface, path: Path) -> Surface:
     return surface
 
 
+def _joined(surface: Surface) -> Surface:
+    """Return a surface whose triangles share vertices, also where those miss each other by little."""
+    kept, same = topology.first_equals(surface.vertices_mm)
+    return Surface(
+        surface.vertices_mm[kept], topology.without_cracks(surface.vertices_mm[kept], same[surface.faces])[0]
+    )
+
+
 def _diagonal(surface: Surface) -> float:
     """Return the diagonal of the bounding box."""
     used = surface.vertices_mm[np.unique(surface.faces)]
@@ -201,10 +207,9 @@ def _diagonal(surface: Surface) -> float:
 
 def hydraulic_diameter(surface: Surface) -> float:
     """Return the hydraulic diameter 4 V / A of the capped surface, in the unit of the surface."""
-    kept, same = topology.first_equals(surface.vertices_mm)
-    welded = same[surface.faces].astype(np.int32)
-    faces, _ = topology.oriented(welded[topology.sound_faces(welded)])
-    points = surface.vertices_mm[kept]
+    joined = _joined(surface)
+    points = joined.vertices_mm
+    faces, _ = topology.oriented(joined.faces[topology.sound_faces(joined.faces)])
     vertices, closed = triangles.cap(points, faces, triangles.boundary_loops(points, faces))
     return float(4 * abs(triangles.volume(vertices[closed])) / surface.area_mm2)
 

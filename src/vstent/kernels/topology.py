@@ -1,6 +1,6 @@
 """Connectivity of triangle meshes: welding, orientation, components, and separation of non-manifold parts."""
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +51,56 @@ def weld(vertices: Floats, faces: Ints, tolerance: float) -> tuple[Floats, Ints]
     label = _components(len(kept), pairs[:, 0], pairs[:, 1])
     _, first = np.unique(label, return_index=True)
     return vertices[kept[first]], label[same[faces]].astype(np.int32)
+
+
+CRACK_OF_EDGE: Final = (0.001, 0.003, 0.01, 0.03, 0.1)
+"""Widths of cracks that are tried, as fractions of the median length of open edges."""
+CLOSED: Final = 0.5
+"""Smallest fraction of the open edges that meet once cracks are closed; the edges of real openings stay apart."""
+
+
+def without_cracks(vertices: Floats, faces: Ints) -> tuple[Ints, float]:
+    """Merge the vertices of open edges that miss each other by little, where most open edges meet then.
+
+    Parameters
+    ----------
+    vertices, faces : (n, 3) and (m, 3)
+        Mesh without equal vertices.
+
+    Returns
+    -------
+    faces : (m, 3)
+        Faces on the vertices that are kept.
+    width : float
+        Smallest width that closes nearly all cracks that can be closed; 0 where nothing was merged.
+    """
+    edges = edges_of(faces)
+    single = edges.starts[edges.n_uses == 1]
+    face, side = edges.face[single], edges.side[single]
+    rims = np.stack([faces[face, side], faces[face, (side + 1) % 3]], axis=1)
+    rim, place = np.unique(rims, return_inverse=True)
+    place = place.reshape(-1, 2)
+    if not len(rim):
+        return faces, 0.0
+    lengths = np.linalg.norm(vertices[rims[:, 0]] - vertices[rims[:, 1]], axis=1)
+    widths = np.array(CRACK_OF_EDGE) * float(np.median(lengths))
+    tree = cKDTree(vertices[rim])
+    labels = [_components(len(rim), *tree.query_pairs(width, output_type="ndarray").T) for width in widths]
+    closed = np.array([_n_meeting(label[place]) for label in labels])
+    if closed.max() < CLOSED * len(rims):
+        return faces, 0.0
+    best = int(np.argmax(closed >= 0.95 * closed.max()))
+    _, first, group = np.unique(labels[best], return_index=True, return_inverse=True)
+    same = np.arange(len(vertices))
+    same[rim] = rim[first[group]]
+    return same[faces].astype(np.int32), float(widths[best])
+
+
+def _n_meeting(edges: Labels) -> int:
+    """Return the number of edges (e, 2) with two different ends that occur more than once."""
+    ordered = np.sort(edges[edges[:, 0] != edges[:, 1]], axis=1)
+    count = np.unique(ordered[:, 0] * (ordered.max(initial=0) + 1) + ordered[:, 1], return_counts=True)[1]
+    return int(count[count > 1].sum())
 
 
 def first_equals(vertices: Floats) -> tuple[Ints, Ints]:

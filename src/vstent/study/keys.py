@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from vstent.devices.catalogue import find_design
 from vstent.devices.treatment import BARE, Implant, Treatment
-from vstent.errors import ReadError
 from vstent.flow.settings import LATTICE
+from vstent.io.files import existing
 from vstent.io.images import files_of
 from vstent.study.code import code_of
 from vstent.study.store import Key, digest
@@ -158,29 +158,22 @@ def angiogram_key(flow: Key, settings: "AngiogramSettings") -> Key:
     return key_of("vstent.angiography.angiogram", flow, settings)
 
 
-def refuse_missing(path: Path) -> None:
-    """Raise ReadError where an input does not exist."""
-    if not path.exists():
-        raise ReadError(f"{path} does not exist: give a scan (DICOM folder, NIfTI, NRRD, MHA, raw) or a surface")
-
-
 def hash_of(path: Path) -> str:
     """Return the SHA-256 of an input.
 
-    For a folder it covers the names and contents of all files, in the order of their paths. For one file of a scan that
-    has several, it covers the contents of all of them.
+    It covers the contents of all files of the input. For a folder these are its DICOM files in the order of their
+    paths, with their names.
 
     Raises
     ------
     ReadError
-        The input does not exist.
+        The input does not exist, or is neither a file nor a folder.
     """
-    refuse_missing(path)
+    existing(path)
     digest = hashlib.sha256()
-    for file in sorted(path.rglob("*")) if path.is_dir() else files_of(path):
-        if file.is_file():
-            digest.update(file.name.encode() + b"\0" if path.is_dir() else b"")
-            with file.open("rb") as stream:
-                while block := stream.read(1 << 20):
-                    digest.update(block)
+    for file in files_of(path):
+        digest.update(file.name.encode() + b"\0" if path.is_dir() else b"")
+        with file.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
     return digest.hexdigest()

@@ -1,0 +1,89 @@
+"""Read a file with limited memory and time and save its arrays; `vstent.io.apart` starts this module."""
+
+import json
+import struct
+import sys
+import zlib
+from collections.abc import Callable
+from contextlib import suppress
+from math import ceil
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vstent.errors import VstentError
+from vstent.io.scans import read_scan
+from vstent.io.vtk_reader import read_mesh
+
+Content = tuple[dict[str, NDArray[Any]], dict[str, Any]]
+"""Arrays by name, and everything else, as JSON can hold it."""
+WORDS: Final = "words.json"
+"""File with everything that is no array; it is written last."""
+FAULTS: Final = (ArithmeticError, AssertionError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
+"""Errors of libraries on content that they do not expect."""
+
+
+def _scan(path: Path, options: dict[str, Any]) -> Content:
+    """Return the content of a scan."""
+    image = read_scan(path, **options)
+    words = {"modality": image.modality, "notes": image.notes, "is_oriented": image.is_oriented}
+    return {"voxels": image.voxels, "affine_mm": image.affine_mm}, words
+
+
+def _mesh(path: Path, _: dict[str, Any]) -> Content:
+    """Return the content of a surface file."""
+    mesh = read_mesh(path)
+    return {"vertices": mesh.vertices, "faces": mesh.faces}, {"space": mesh.space}
+
+
+READERS: Final[dict[str, Callable[[Path, dict[str, Any]], Content]]] = {"scan": _scan, "mesh": _mesh}
+"""Readers by name."""
+
+
+def main(what: str, path: Path, options: dict[str, Any], folder: Path, limits: dict[str, float]) -> None:
+    """Read a file and save its arrays, or the error that it ends with.
+
+    Parameters
+    ----------
+    what : a key of `READERS`.
+    path : the file or folder.
+    options : arguments of the reader.
+    folder : folder to write into.
+    limits : largest ``memory`` in bytes and CPU time in ``seconds``.
+    """
+    is_own = limit(**limits)
+    try:
+        arrays, words = READERS[what](path, options)
+        for name, values in arrays.items():
+            np.save(folder / f"{name}.npy", values)
+    except VstentError as error:
+        words = {"error": type(error).__name__, "sentence": str(error)}
+    except MemoryError:
+        words = {"error": "Limit" if is_own else "MemoryError"}
+    except OSError as error:
+        words = {"error": "OSError", "errno": error.errno or 0, "file": str(error.filename or path)}
+    except (*FAULTS, EOFError, struct.error, zlib.error) as error:
+        reason = " ".join(str(error).split())[:120]
+        words = {"error": "ReadError", "sentence": f"{path.name} is damaged ({reason}). Copy or export it again."}
+    (folder / WORDS).write_text(json.dumps(words), encoding="utf-8")
+
+
+def limit(memory: float, seconds: float) -> bool:
+    """Limit memory in bytes and CPU time in s of this process; return whether that of memory is the lower one."""
+    with suppress(ImportError):  # Windows has no such limits
+        import resource
+
+        own = {resource.RLIMIT_AS: int(memory), resource.RLIMIT_CPU: ceil(seconds)}
+        given = {what: resource.getrlimit(what)[0] for what in own}
+        for what, most in own.items():
+            if given[what] == resource.RLIM_INFINITY or given[what] > most:
+                with suppress(ValueError, OSError):
+                    resource.setrlimit(what, (most, most))
+        return resource.getrlimit(resource.RLIMIT_AS)[0] == own[resource.RLIMIT_AS]
+    return False
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], Path(sys.argv[2]), json.loads(sys.argv[3]), Path(sys.argv[4]), json.loads(sys.argv[5]))

@@ -1,0 +1,100 @@
+"""Read NRRD and MetaImage files as an `Image`, with ITK."""
+
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vstent.errors import ReadError, UnitError
+from vstent.geometry.image import Image
+from vstent.io.files import suffix
+from vstent.io.limits import MOST_PACKED, refuse_bomb
+from vstent.io.text_headers import fields_of, holds_segments, mm_per_unit, states_spacing, voxel_files
+
+
+def read_itk(path: Path, *, has_spacing: bool) -> Image:
+    """Read one volume from a NRRD or MetaImage file.
+
+    Parameters
+    ----------
+    path : the file, or the header of a file of voxels.
+    has_spacing : whether the caller replaces the spacing, so that the header need not state it.
+
+    Returns
+    -------
+    Image
+        Voxels (i, j, k) and the affine from voxel to LPS mm.
+
+    Raises
+    ------
+    ReadError
+        The file is damaged, or holds something other than one volume of single values.
+    UnitError
+        The header does not state the voxel spacing, or its unit is not known.
+    """
+    import SimpleITK
+
+    fields, apart = fields_of(path), voxel_files(path)
+    reader = SimpleITK.ImageFileReader()
+    try:
+        reader.SetFileName(str(path))
+        reader.ReadImageInformation()
+        _refuse_untrue(path, apart, reader)
+        scan = reader.Execute()
+    except RuntimeError as error:
+        raise ReadError(
+            f"{path.name} is damaged or not a {suffix(path)} file{_reason(error)}. Copy or export it again."
+        ) from None
+    if not has_spacing and not states_spacing(path, fields):
+        raise UnitError(f"{path.name} does not state a voxel spacing above zero; give --spacing in mm.")
+    if scan.GetDimension() == 4 and scan.GetSize()[3] == 1:
+        scan = scan[:, :, :, 0]
+    notes: tuple[str, ...] = ()
+    if scan.GetDimension() == 3 and scan.GetNumberOfComponentsPerPixel() > 1 and holds_segments(path):
+        notes = (f"The segments in {scan.GetNumberOfComponentsPerPixel()} layers of the file are united.",)
+        layers = SimpleITK.GetArrayViewFromImage(scan).any(axis=-1).astype(np.uint8)
+        united = SimpleITK.GetImageFromArray(layers)
+        united.CopyInformation(scan)
+        scan = united
+    if scan.GetDimension() != 3 or scan.GetNumberOfComponentsPerPixel() != 1 or scan.GetPixelID() < 0:
+        raise ReadError(
+            f"{path.name} has {scan.GetDimension()} dimensions and {scan.GetNumberOfComponentsPerPixel()} values per "
+            "voxel. Export one volume with one value per voxel."
+        )
+    unit_mm = np.ones(3) if has_spacing else np.array(mm_per_unit(path, fields))
+    affine = np.eye(4)
+    affine[:3, :3] = np.reshape(scan.GetDirection(), (3, 3)) * scan.GetSpacing()
+    affine[:3, 3] = scan.GetOrigin()
+    affine[:3] *= unit_mm[:, None]
+    return Image(SimpleITK.GetArrayViewFromImage(scan).transpose(), affine, notes=notes)
+
+
+def _refuse_untrue(path: Path, apart: list[Path], reader: Any) -> None:
+    """Raise ReadError where a header states more than the files hold, because ITK would fill the rest with zeros."""
+    import SimpleITK
+
+    size = reader.GetSize()
+    if min(size) < 1 or reader.GetPixelID() < 0:
+        raise ReadError(f"{path.name} has no voxels of a supported type. Export it again as integers.")
+    voxel = SimpleITK.Image([1] * reader.GetDimension(), reader.GetPixelID(), reader.GetNumberOfComponents())
+    n_bytes = math.prod(size) * voxel.GetNumberOfComponentsPerPixel() * voxel.GetSizeOfPixelComponent()
+    announced = f"{path.name} states {' x '.join(map(str, size))} voxels"
+    n_held = sum(file.stat().st_size for file in apart if os.path.isfile(file)) or path.stat().st_size
+    if n_bytes > MOST_PACKED * n_held:
+        raise ReadError(
+            f"{announced}, {n_bytes / 1e9:.3g} GB, but has {n_held} bytes: it is damaged and breaks off. Copy or "
+            "export it again."
+        )
+    refuse_bomb(announced, n_bytes, n_held)
+
+
+def _reason(error: Exception) -> str:
+    """Return the last plain sentence of an ITK exception in parentheses, or nothing where it gives no reason."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    last = lines[-1].split("): ", 1)[-1].rstrip(".") if lines else ""
+    says_little = (
+        not last or "sitk::ERROR" in last or last.startswith("Reason:") or " " not in last.strip("0123456789 ")
+    )
+    return "" if says_little else f" ({last[:150]})"
