@@ -1,6 +1,7 @@
 """Nothing that was computed is lost: every pair of an existing case and a new command."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,25 +10,32 @@ import pytest
 
 from vstent import phantoms
 from vstent.devices.catalogue import find_design
-from vstent.devices.treatment import with_device
+from vstent.devices.treatment import Implant, Placing, Treatment, with_device
 from vstent.errors import FlowError, InputError, LandingError
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.settings import FlowSettings, Numerics
 from vstent.geometry.surface import Surface
 from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_stl
-from vstent.plan.ranges import Ranges
 from vstent.plan.rank import rank
-from vstent.study import keys as study_keying
+from vstent.plan.uncertainty import Ranges
 from vstent.study import stages
+from vstent.study.folder import CACHE, INPUT
 from vstent.study.keys import implant_keys, study_keys
 from vstent.study.outputs import write_ranking
 from vstent.study.pipeline import refine_flow, restore_vessel, run, trace_vessel
-from vstent.study.settings import AnatomySettings, InputSettings, Settings
 from vstent.study.store import Key
+from vstent.study.settings import AnatomySettings, InputSettings, Settings
 
 FLOW = FlowSettings(inflow_mL_s=2.0, numerics=Numerics(cell_size_mm=0.5, max_steps=20))
-PLAIN = Settings(treatments=(with_device("silk"),), input=InputSettings(units="mm"), flow=None)
+
+
+def of(*devices: str, **more: object) -> Settings:
+    """Return the settings of a study of a surface in mm, with a treatment for every device and without a flow."""
+    return Settings(InputSettings("mm"), treatments=tuple(map(with_device, devices)), **{"flow": None} | more)
+
+
+PLAIN = of("silk")
 
 
 @pytest.fixture(scope="module")
@@ -40,17 +48,22 @@ def arteries(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return folder / "first.stl", folder / "second.stl"
 
 
-@pytest.fixture(autouse=True)
-def bare_flow_for_all(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Compute a flow without a device once; with one it is the same. Returns what was computed, in order."""
+def bare_flow(patch: pytest.MonkeyPatch) -> list[str]:
+    """Compute a flow without a device once; with one it is the same. Returns what is computed, in order."""
     real, computed = stages.simulate_case, []
 
     def quick(case: FlowCase, *, start: FlowField | None, **given: object) -> FlowField:
         computed.append("device" if case.media else "bare")
         return start if start is not None else real(case, start=start, **given)
 
-    monkeypatch.setattr(stages, "simulate_case", quick)
+    patch.setattr(stages, "simulate_case", quick)
     return computed
+
+
+@pytest.fixture(autouse=True)
+def bare_flow_for_all(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Do that in every test."""
+    return bare_flow(monkeypatch)
 
 
 def quiet(*_: object) -> None:
@@ -59,38 +72,50 @@ def quiet(*_: object) -> None:
 
 def held(folder: Path) -> dict[str, bytes]:
     """Return the files of devices and flows of a case folder, and what was found of other kinds."""
-    names = ("treatments/**/*", "convergence/**/*", "morphology.json", "ranking.csv", "convergence.json", "report.html")
+    names = ("treatments/**/*", "morphology.json", "ranking.csv", "convergence.json", "report.html")
     files = [path for name in names for path in folder.glob(name) if path.is_file()]
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
+TANDEM = Treatment("tandem", (Implant("a", "silk"), Implant("b", "silk", placing=Placing(shift_mm=2.0), inside=("a",))))
 EXISTING = {
     "a device": PLAIN,
-    "two devices": replace(PLAIN, treatments=(with_device("silk"), with_device("enterprise"))),
-    "a device and its flow": replace(PLAIN, flow=FLOW),
+    "two devices": of("silk", "enterprise"),
+    "a device and its flow": of("silk", flow=FLOW),
     "a size": replace(PLAIN, treatments=(with_device("silk", diameter_mm=4.0, length_mm=20.0),)),
-    "a spread": replace(PLAIN, uncertainty=Ranges(samples=2)),
+    "a spread": of("silk", uncertainty=Ranges(samples=2)),
 }
 COMMANDS = {
-    "another device": replace(PLAIN, treatments=(with_device("pipeline"),)),
-    "another device and its flow": replace(PLAIN, treatments=(with_device("enterprise"),), flow=FLOW),
+    "another device": of("pipeline"),
+    "another device and its flow": of("enterprise", flow=FLOW),
     "the same device": PLAIN,
-    "the same device and its flow": replace(PLAIN, flow=FLOW),
-    "the same and another": replace(PLAIN, treatments=(with_device("silk"), with_device("leo"))),
-    "another size": replace(PLAIN, diameter_mm=4.0, length_mm=15.0),
-    "another flow": replace(PLAIN, flow=replace(FLOW, inflow_mL_s=3.0)),
-    "less artery": replace(PLAIN, upstream_mm=12.0),
-    "another spread": replace(PLAIN, uncertainty=Ranges(samples=3)),
+    "the same device and its flow": of("silk", flow=FLOW),
+    "the same and two in one": replace(PLAIN, treatments=(with_device("silk"), TANDEM)),
+    "another size": replace(PLAIN, treatments=(with_device("silk", diameter_mm=4.0, length_mm=15.0),)),
+    "another flow": of("silk", flow=replace(FLOW, inflow_mL_s=3.0)),
+    "less artery": replace(PLAIN, anatomy=AnatomySettings(upstream_mm=12.0)),
+    "another spread": of("silk", uncertainty=Ranges(samples=3)),
 }
+
+
+@pytest.fixture(scope="module")
+def existing(arteries: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Case folders by what they hold."""
+    folders = {name: tmp_path_factory.mktemp("existing") / "out" for name in EXISTING}
+    with pytest.MonkeyPatch.context() as patch:
+        bare_flow(patch)
+        for name, out in folders.items():
+            run(arteries[0], out, EXISTING[name], quiet)
+    return folders
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-@pytest.mark.parametrize("existing", EXISTING)
+@pytest.mark.parametrize("held_before", EXISTING)
 def test_after_any_command_all_that_a_folder_held_is_there_or_the_command_is_refused(
-    arteries: tuple[Path, Path], tmp_path: Path, existing: str, command: str
+    arteries: tuple[Path, Path], existing: dict[str, Path], tmp_path: Path, held_before: str, command: str
 ) -> None:
     out = tmp_path / "out"
-    run(arteries[0], out, EXISTING[existing], quiet)
+    shutil.copytree(existing[held_before], out)
     before, metrics = held(out), json.loads((out / "metrics.json").read_text())
     refused = ""
     try:
@@ -104,11 +129,11 @@ def test_after_any_command_all_that_a_folder_held_is_there_or_the_command_is_ref
         return
     after = held(out)
     assert {name: after.get(name) for name in before} == before
-    told = json.loads((out / "metrics.json").read_text())
-    for name, found in metrics["treatments"].items():
-        assert found.items() <= told["treatments"][name].items()
-    asked = {treatment.name for treatment in COMMANDS[command].treatments}
-    assert set(told["treatments"]) - {"bare"} == (set(metrics["treatments"]) | asked) - {"bare"}
+    told = json.loads((out / "metrics.json").read_text())["treatments"]
+    for name, of_treatment in metrics["treatments"].items():
+        assert of_treatment.items() <= told[name].items()
+    named = {one.name for one in COMMANDS[command].treatments}
+    assert {*told} - {"bare"} == {*metrics["treatments"], *named} - {"bare"}
 
 
 @pytest.mark.parametrize("command", [run, restore_vessel, trace_vessel, refine_flow])
@@ -125,11 +150,9 @@ def test_another_input_is_refused_unless_it_is_to_replace(
 
 def test_added_devices_are_what_they_are_in_a_folder_of_their_own(arteries: tuple[Path, Path], tmp_path: Path) -> None:
     out, anew = tmp_path / "out", tmp_path / "anew"
-    run(arteries[0], out, replace(PLAIN, flow=FLOW), quiet)
-    run(arteries[0], out, replace(PLAIN, treatments=(with_device("enterprise"),), flow=FLOW), quiet)
-    run(
-        arteries[0], anew, replace(PLAIN, treatments=(with_device("silk"), with_device("enterprise")), flow=FLOW), quiet
-    )
+    run(arteries[0], out, of("silk", flow=FLOW), quiet)
+    run(arteries[0], out, of("enterprise", flow=FLOW), quiet)
+    run(arteries[0], anew, of("silk", "enterprise", flow=FLOW), quiet)
     assert (out / "metrics.json").read_bytes() == (anew / "metrics.json").read_bytes()
 
 
@@ -137,13 +160,13 @@ def test_a_device_added_without_flow_gets_none_and_the_flows_stay(
     arteries: tuple[Path, Path], tmp_path: Path, bare_flow_for_all: list[str]
 ) -> None:
     out = tmp_path / "out"
-    run(arteries[0], out, replace(PLAIN, flow=FLOW), quiet)
-    case = run(arteries[0], out, replace(PLAIN, treatments=(with_device("pipeline"),)), quiet)
+    run(arteries[0], out, of("silk", flow=FLOW), quiet)
+    case = run(arteries[0], out, of("pipeline"), quiet)
     assert bare_flow_for_all == ["bare", "device"]
     assert set(case.fields) == {"bare", "silk"}
     assert set(case.implants) == {"silk", "pipeline"}
     assert "flow" not in case.metrics["treatments"]["pipeline"]
-    later = run(arteries[0], out, replace(PLAIN, treatments=(with_device("pipeline"),), flow=FLOW), quiet)
+    later = run(arteries[0], out, of("pipeline", flow=FLOW), quiet)
     assert bare_flow_for_all == ["bare", "device", "device"]
     assert set(later.fields) == {"bare", "silk", "pipeline"}
 
@@ -151,15 +174,15 @@ def test_a_device_added_without_flow_gets_none_and_the_flows_stay(
 def test_a_device_that_does_not_fit_is_a_row_with_its_reason(
     arteries: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = replace(PLAIN, treatments=(with_device("silk"), with_device("enterprise")))
-    real = stages.deploy_one
+    settings = of("silk", "enterprise")
+    real = stages.deploy_implant
 
-    def too_long(design: object, *given: object) -> object:
-        if design.key == "silk":
+    def too_long(implant: Implant, *given: object) -> object:
+        if implant.device == "silk":
             raise LandingError("No size of Silk fits: choose another device.")
-        return real(design, *given)
+        return real(implant, *given)
 
-    monkeypatch.setattr(stages, "deploy_one", too_long)
+    monkeypatch.setattr(stages, "deploy_implant", too_long)
     case = run(arteries[0], tmp_path / "out", settings, quiet)
     assert set(case.implants) == {"enterprise"}
     assert case.failures == {"silk": "not deployed: No size of Silk fits: choose another device."}
@@ -173,10 +196,7 @@ def test_a_device_that_does_not_fit_is_a_row_with_its_reason(
 def test_a_flow_that_diverges_is_a_row_with_its_reason(
     arteries: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings, real = (
-        replace(PLAIN, treatments=(with_device("silk"), with_device("enterprise")), flow=FLOW),
-        stages.simulate_case,
-    )
+    settings, real = of("silk", "enterprise", flow=FLOW), stages.simulate_case
 
     def diverging(case: FlowCase, **given: object) -> FlowField:
         if case.solids and case.solids[0].design.key == "silk":
@@ -187,26 +207,30 @@ def test_a_flow_that_diverges_is_a_row_with_its_reason(
     case = run(arteries[0], tmp_path, settings, quiet)
     assert set(case.fields) == {"bare", "enterprise"}
     assert case.failures == {"silk": "flow not computed: the flow diverged: use a finer grid spacing"}
-    assert "implants" in case.metrics["treatments"]["silk"]
+    assert case.metrics["treatments"]["silk"].keys() == {"implants"}
 
 
 def test_keys_change_with_what_a_stage_uses_and_with_nothing_else() -> None:
-    keys = study_keys("source", Settings())
-    assert list(keys) == [
-        *("vessel", "anatomy", "deploy silk", "deploy enterprise"),
-        *("flow bare", "flow silk", "flow enterprise"),
-    ]
+    given = replace(Settings(), treatments=(with_device("enterprise"), TANDEM))
+    keys = study_keys("source", given)
+    tandem = {"deploy tandem a", "deploy tandem b", "flow tandem"}
+    assert {*keys} == {"vessel", "anatomy", "deploy enterprise", "flow bare", "flow enterprise"} | tandem
 
     def changed(**settings: object) -> set[str]:
-        other = study_keys("source", replace(Settings(), **settings))
-        return {name for name in keys if name in other and other[name] != keys[name]}
+        other = study_keys("source", replace(given, **settings))
+        return {name for name in keys if name in other and other[name].given != keys[name].given}
 
-    sized, enterprise = with_device("silk", diameter_mm=4.0, length_mm=20.0), with_device("enterprise")
-    assert changed(treatments=(sized, enterprise)) == {"deploy silk", "flow silk"}
-    assert changed(flow=FLOW) == {"flow bare", "flow silk", "flow enterprise"}
+    first, second = TANDEM.implants
+    for implants, expected in (
+        ((replace(first, length_mm=20.0), second), tandem),
+        ((first, replace(second, length_mm=20.0)), tandem - {"deploy tandem a"}),
+    ):
+        assert changed(treatments=(with_device("enterprise"), Treatment("tandem", implants))) == expected
+    assert changed(flow=FLOW) == {"flow bare", "flow enterprise", "flow tandem"}
     assert changed(anatomy=AnatomySettings(outlet_mm=(0.0, 0.0, 0.0))) == {*keys} - {"vessel"}
-    assert changed(treatments=(replace(with_device("silk"), has_flow=False), enterprise)) == set()
+    assert changed(treatments=(replace(with_device("enterprise"), has_flow=False), TANDEM)) == set()
     assert changed(input=InputSettings(threshold=500.0)) == {*keys}
+    assert all(study_keys("another", given)[name].given != key.given for name, key in keys.items())
 
 
 def test_a_deployment_is_found_again_though_ranges_and_sources_of_its_numbers_change(
@@ -217,11 +241,44 @@ def test_a_deployment_is_found_again_though_ranges_and_sources_of_its_numbers_ch
     assert design.facts
 
     def key(**numbers: object) -> Key:
-        monkeypatch.setattr(study_keying, "find_design", lambda _: replace(design, **numbers))
+        monkeypatch.setattr("vstent.study.keys.find_design", lambda _: replace(design, **numbers))
         return implant_keys(anatomy, with_device("silk"))["silk"]
 
     assert key(ranges=(), facts=()) == key()
     assert key(braid_angle_rad=1.1) != key()
+
+
+@pytest.mark.parametrize("states", [f"{CACHE}/{INPUT}", "run.json"])
+@pytest.mark.parametrize("command", [run, restore_vessel, trace_vessel, refine_flow])
+def test_a_folder_of_an_older_version_is_refused_and_nothing_in_it_is_touched(
+    arteries: tuple[Path, Path], tmp_path: Path, states: str, command: object
+) -> None:
+    (tmp_path / CACHE).mkdir()
+    (tmp_path / states).write_text('{"path": "artery.stl", "sha256": "0", "settings": {"devices": ["silk"]}}')
+    (tmp_path / CACHE / ".partial-0-1.npz").write_text("half")
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    for replaces in (False, True):
+        with pytest.raises(InputError, match=r"older version of vstent\. Give another --out, or delete that folder\."):
+            command(arteries[0], tmp_path, PLAIN, quiet, replaces=replaces)
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+
+
+@pytest.mark.parametrize("damage", ["", "[]", "{", '{"seconds": 1}', '{"seconds": {"a": "b"}}', 9999 * "[", "\0\xff"])
+def test_a_damaged_or_foreign_file_is_computed_again(
+    arteries: tuple[Path, Path], existing: dict[str, Path], tmp_path: Path, damage: str
+) -> None:
+    out, computed = tmp_path / "out", []
+    shutil.copytree(existing["a device"], out)
+    metrics, kept = (out / "metrics.json").read_bytes(), [*(out / CACHE).glob("*-*-*.*")]
+    for path in kept:
+        path.write_text(damage)
+    run(arteries[0], out, PLAIN, lambda now: computed.append(now.stage) if now.detail != "already done" else None)
+    assert {"segment", "trace", "trim", "restore", "deploy silk", "struts silk", "measure"} <= {*computed}
+    assert (out / "metrics.json").read_bytes() == metrics
+    assert {path.name for path in (out / CACHE).glob("*-*-*.*")} == {path.name for path in kept}
+    computed.clear()
+    run(arteries[0], out, PLAIN, lambda now: computed.append(now.stage) if now.fraction == 1.0 else None)
+    assert "segment" not in computed
 
 
 def test_a_ranking_of_another_device_keeps_the_rows_of_the_former_one(
@@ -236,10 +293,10 @@ def test_a_ranking_of_another_device_keeps_the_rows_of_the_former_one(
 
 
 def test_a_point_in_another_frame_is_recognized(arteries: tuple[Path, Path], tmp_path: Path) -> None:
-    surface, _ = read_surface(arteries[0], input=InputSettings(units="mm"))
+    surface, _ = read_surface(arteries[0], units="mm")
     moved = tmp_path / "moved.stl"
     write_stl(moved, Surface(surface.vertices_mm + np.array([40.0, 25.0, 0.0]), surface.faces))
     anatomy, _ = restore_vessel(moved, tmp_path / "out", PLAIN, quiet)
     x, y, z = anatomy.aneurysms[0].sac.vertices_mm.mean(axis=0).tolist()
     with pytest.raises(InputError, match=rf"Did you mean {x:.1f},{y:.1f},{z:.1f} \(the point given is RAS\)\?"):
-        restore_vessel(moved, tmp_path / "other", replace(PLAIN, at_mm=(-x, -y, z)), quiet)
+        restore_vessel(moved, tmp_path / "other", replace(PLAIN, anatomy=AnatomySettings((-x, -y, z))), quiet)

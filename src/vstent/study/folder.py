@@ -9,7 +9,7 @@ from functools import wraps
 from pathlib import Path
 from typing import IO, Concatenate, Final, ParamSpec, TypeVar
 
-from vstent.errors import FolderError, InputError
+from vstent.errors import FolderError, ReadError
 from vstent.io.files import sweep
 from vstent.study.store import UNREADABLE
 
@@ -61,11 +61,11 @@ def flow_folder(out: Path, treatment: str) -> Path:
 
 
 def refuse_older(out: Path) -> None:
-    """Raise InputError where a folder is a case folder of another layout."""
+    """Raise ReadError where a folder is a case folder of another layout."""
     for path in (out / CACHE / INPUT, out / RUN):
         with suppress(*UNREADABLE):
             if json.loads(path.read_text(encoding="utf-8")).get("layout") != LAYOUT:
-                raise InputError(
+                raise ReadError(
                     f"{out} was written by an older version of vstent. Give another --out, or delete that folder."
                 )
 
@@ -85,7 +85,7 @@ def claimed(out: Path) -> Iterator[None]:
     ------
     FolderError
         Another process uses the folder, or it cannot be written.
-    InputError
+    ReadError
         It is a case folder of an older version.
     """
     refuse_older(out)
