@@ -27,12 +27,13 @@ from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_stl
 from vstent.study import stages
 from vstent.study.crate import write_crate
+from vstent.study.folder import implant_folder
 from vstent.study.keys import hash_of, study_keys
 from vstent.study.outputs import write_anatomy
 from vstent.study.pipeline import restore_vessel, run
-from vstent.study.settings import AnatomySettings, InputSettings, Settings
 from vstent.study.stages import deploy_implant, engine_folders, size_of
 from vstent.study.store import Key, Store
+from vstent.study.settings import AnatomySettings, InputSettings, Settings
 
 
 def test_every_sac_has_its_files_and_those_of_an_earlier_case_go(tmp_path: Path) -> None:
@@ -42,7 +43,7 @@ def test_every_sac_has_its_files_and_those_of_an_earlier_case_go(tmp_path: Path)
     (tmp_path / "sac_mine.vtp").write_text("a user's own")
     write_anatomy(tmp_path, replace(artery, aneurysms=(first, second)))
     for number, aneurysm in (("", first), ("_2", second)):
-        sac, _ = read_surface(tmp_path / f"sac{number}.vtp", input=InputSettings(units="mm"))
+        sac, _ = read_surface(tmp_path / f"sac{number}.vtp", units="mm")
         assert sac.area_mm2 == pytest.approx(aneurysm.sac.area_mm2, rel=1e-5)
         assert (tmp_path / f"neck{number}.vtp").stat().st_size > 500
     write_anatomy(tmp_path, artery)
@@ -75,7 +76,7 @@ def test_of_a_diameter_alone_the_length_is_as_long_as_that_diameter_needs(
     name: str, diameter_mm: float, length_mm: float
 ) -> None:
     artery, design = with_neck(tube(line(60), 1.75), 24.0, 36.0), find_design(name)
-    size = size_of(Implant(design.key, design.key, diameter_mm), artery)
+    size = size_of(Implant("one", name, diameter_mm), artery)
     assert (size.diameter_mm, size.length_mm) == (diameter_mm, length_mm)
     margins = {}
     for length in sorted(size.length_mm for size in design.sizes if size.diameter_mm == diameter_mm):
@@ -89,8 +90,9 @@ def test_of_a_diameter_alone_the_length_is_as_long_as_that_diameter_needs(
 
 def test_of_a_length_alone_the_diameter_is_the_artery_s() -> None:
     artery, silk = with_neck(tube(line(60), 1.75), 28.0, 32.0), find_design("silk")
-    assert size_of(Implant("silk", "silk", length_mm=25.0), artery) == find_size(silk, diameter_mm=3.5, length_mm=25.0)
-    assert size_of(Implant("silk", "silk"), artery) == propose_size(silk, artery)
+    found = size_of(Implant("one", "silk", length_mm=25.0), artery)
+    assert found == find_size(silk, diameter_mm=3.5, length_mm=25.0)
+    assert size_of(Implant("one", "silk"), artery) == propose_size(silk, artery)
 
 
 def test_a_size_given_whole_is_taken_though_none_could_be_proposed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -98,11 +100,11 @@ def test_a_size_given_whole_is_taken_though_none_could_be_proposed(monkeypatch: 
     wide = Size(4.0, 8.0, 4.2)
     own = replace(silk, sizes=(Size(3.0, 25.0, 3.2), Size(3.5, 25.0, 3.7), wide))
     monkeypatch.setattr(stages, "find_design", lambda _: own)
-    assert deploy_implant(Implant("own", "own", 4.0, 8.0), artery).stent.size == wide
+    assert deploy_implant(Implant("one", "own", 4.0, 8.0), artery).stent.size == wide
     with pytest.raises(LandingError, match="No size of"):
-        size_of(Implant("own", "own"), artery)
+        size_of(Implant("one", "own"), artery)
     with pytest.raises(DeviceError, match=r"not made in 4\.1 mm"):
-        size_of(Implant("own", "own", 4.1), artery)
+        size_of(Implant("one", "own", 4.1), artery)
 
 
 @pytest.fixture(scope="module")
@@ -120,11 +122,14 @@ RESULTS_OF_ONE = (
     *("treatments/bare/flow/openfoam/vstent.key", "treatments/bare/flow/openfoam/system/controlDict"),
 )
 OF_THE_USER = (
-    "notes.txt",
-    "treatments/silk/implants/silk/mine.vtp",
-    "treatments/my.stl",
+    *("notes.txt", "treatments/silk/implants/silk/mine.vtp", "treatments/my.stl"),
     "treatments/mine/flow/case/field.vtu",
 )
+
+
+def settings_of(*devices: str, **more: object) -> Settings:
+    """Return the settings of a study of a surface in mm, with a treatment for every device and without a flow."""
+    return Settings(InputSettings("mm"), treatments=tuple(map(with_device, devices)), **{"flow": None} | more)
 
 
 def shown(folder: Path) -> set[str]:
@@ -139,7 +144,7 @@ def test_a_folder_replaced_by_another_patient_s_holds_nothing_of_the_former(
 ) -> None:
     first, second = arteries
     out = tmp_path / "out"
-    settings = Settings(treatments=(with_device("silk"),), input=InputSettings(units="mm"), flow=None)
+    settings = settings_of("silk")
     run(first, out, settings, lambda *_: None)
     for name in (*RESULTS_OF_ONE, *OF_THE_USER):
         (out / name).parent.mkdir(parents=True, exist_ok=True)
@@ -149,10 +154,16 @@ def test_a_folder_replaced_by_another_patient_s_holds_nothing_of_the_former(
         (out / ".vstent" / "input.json").unlink()
     before = {name: (out / name).read_bytes() for name in shown(out)}
     with pytest.raises(InputError):
-        run(second, out, replace(settings, length_mm=1e3), lambda *_: None, replaces=True)
+        run(
+            second,
+            out,
+            replace(settings, treatments=(with_device("silk", length_mm=1e3),)),
+            lambda *_: None,
+            replaces=True,
+        )
     assert {name: (out / name).read_bytes() for name in shown(out)} == before
 
-    again = replace(settings, treatments=(with_device("enterprise"),))
+    again = settings_of("enterprise")
     run(second, out, again, lambda *_: None, replaces=True)
     run(second, tmp_path / "anew", again, lambda *_: None, replaces=True)
     assert shown(out) == shown(tmp_path / "anew") | set(OF_THE_USER)
@@ -166,7 +177,7 @@ def test_the_same_patient_keeps_what_was_found_and_another_one_that_replaces_it_
     first, second = arteries
     moved = tmp_path / "moved.stl"
     moved.write_bytes(first.read_bytes())
-    settings = Settings(treatments=(with_device("silk"),), input=InputSettings(units="mm"), flow=None)
+    settings = settings_of("silk")
     run(first, tmp_path / "out", settings, lambda *_: None)
     (tmp_path / "out" / "report.pdf").write_text("of the first")
     before = shown(tmp_path / "out")
@@ -182,12 +193,9 @@ def test_a_folder_replaced_with_other_settings_holds_nothing_of_the_former(
     arteries: tuple[Path, Path], tmp_path: Path
 ) -> None:
     out, anew = tmp_path / "out", tmp_path / "anew"
-    former = Settings(
-        treatments=(with_device("silk"), with_device("enterprise")),
-        input=InputSettings(units="mm"),
-        flow=FlowSettings(numerics=Numerics(cell_size_mm=0.5, engine="openfoam")),
-    )
-    written_by_openfoam = [*engine_folders(out, former).values(), out / "flow" / "convergence" / "openfoam" / "grid"]
+    foam = FlowSettings(numerics=Numerics(cell_size_mm=0.5, engine="openfoam"))
+    former = settings_of("silk", "enterprise", flow=foam)
+    written_by_openfoam = [*engine_folders(out, former).values(), out / "convergence" / "openfoam" / "grid"]
     run(arteries[0], out, replace(former, flow=None), lambda *_: None, replaces=True)
     restore_vessel(arteries[0], out, former, lambda *_: None)
     for name in (*RESULTS_OF_ONE, *OF_THE_USER, "report.html", "ro-crate-metadata.json"):
@@ -198,17 +206,23 @@ def test_a_folder_replaced_with_other_settings_holds_nothing_of_the_former(
         (folder / "vstent.key").write_text("a key")
     cached = {path.name for path in (out / ".vstent").glob("*.npz")}
     with pytest.raises(InputError):
-        run(arteries[0], out, replace(former, flow=None, length_mm=1e3), lambda *_: None, replaces=True)
+        run(
+            arteries[0],
+            out,
+            replace(former, flow=None, treatments=(with_device("silk", length_mm=1e3),)),
+            lambda *_: None,
+            replaces=True,
+        )
     assert (out / "report.pdf").exists()
 
-    settings = replace(former, treatments=(with_device("enterprise"),), flow=None)
+    settings = settings_of("enterprise")
     run(arteries[0], out, settings, lambda *_: None, replaces=True)
     run(arteries[0], anew, settings, lambda *_: None, replaces=True)
     convergence = "convergence/openfoam/grid/vstent.key"
     assert shown(out) == shown(anew) | {*OF_THE_USER, "ranking.csv", "morphology.json", convergence}
     assert (out / "metrics.json").read_bytes() == (anew / "metrics.json").read_bytes()
     assert {path.name for path in (out / ".vstent").glob("*.npz")} == cached
-    run(arteries[0], out, replace(settings, upstream_mm=6.0), lambda *_: None, replaces=True)
+    run(arteries[0], out, replace(settings, anatomy=AnatomySettings(upstream_mm=6.0)), lambda *_: None, replaces=True)
     assert shown(out) == shown(anew) | {*OF_THE_USER, "ranking.csv"}
 
 
@@ -226,11 +240,8 @@ def test_stopped_while_replacing_a_folder_holds_nothing_of_the_former_beside_the
         return start if start is not None else real(case, start=start, **given)
 
     monkeypatch.setattr(stages, "simulate_case", counted)
-    slow = Settings(
-        treatments=(with_device("silk"),),
-        input=InputSettings(units="mm"),
-        flow=FlowSettings(inflow_mL_s=1.0, numerics=Numerics(cell_size_mm=0.5, max_steps=20)),
-    )
+    flow = FlowSettings(inflow_mL_s=1.0, numerics=Numerics(cell_size_mm=0.5, max_steps=20))
+    slow = settings_of("silk", flow=flow)
     fast = replace(slow, flow=replace(slow.flow, inflow_mL_s=3.0))
     run(arteries[0], out, slow, lambda *_: None, replaces=True)
     (out / "report.html").write_text("of the slow flow")
@@ -260,9 +271,7 @@ def test_what_is_kept_damaged_is_found_anew_and_replaced(arteries: tuple[Path, P
 
     def stages_told() -> set[str]:
         told.clear()
-        restore_vessel(
-            arteries[0], tmp_path, Settings(input=InputSettings(units="mm")), lambda now: told.append(now.stage)
-        )
+        restore_vessel(arteries[0], tmp_path, settings_of(), lambda now: told.append(now.stage))
         return set(told)
 
     assert stages_told() == {"segment", "trace", "trim", "restore"}
@@ -273,7 +282,7 @@ def test_what_is_kept_damaged_is_found_anew_and_replaced(arteries: tuple[Path, P
 
 
 def test_a_crate_does_not_outlive_what_it_describes(arteries: tuple[Path, Path], tmp_path: Path) -> None:
-    settings = Settings(treatments=(with_device("silk"),), input=InputSettings(units="mm"), flow=None)
+    settings = settings_of("silk")
     case = run(arteries[0], tmp_path, settings, lambda *_: None)
     write_crate(tmp_path, case.provenance, "2026-01-01")
     run(arteries[0], tmp_path, settings, lambda *_: None)
@@ -284,8 +293,8 @@ def test_trimmed_otherwise_the_vessel_is_the_one_that_was_traced_and_the_result_
     artery, told = tmp_path / "artery.stl", []
     tube = phantoms.tube(length_mm=24.0)
     write_stl(artery, phantoms.phantom_surface(phantoms.with_sac(tube, abscissa_mm=12.0), edge_mm=0.6))
-    shorter = Settings(input=InputSettings(units="mm"), anatomy=AnatomySettings(upstream_mm=7.0))
-    restore_vessel(artery, tmp_path / "again", Settings(input=InputSettings(units="mm")), lambda *_: None)
+    shorter = replace(settings_of(), anatomy=AnatomySettings(upstream_mm=7.0))
+    restore_vessel(artery, tmp_path / "again", settings_of(), lambda *_: None)
     again, _ = restore_vessel(artery, tmp_path / "again", shorter, lambda now: told.append(now.stage))
     anew, _ = restore_vessel(artery, tmp_path / "anew", shorter, lambda *_: None)
     assert list(dict.fromkeys(told)) == ["vessel", "trim", "restore"]
@@ -300,9 +309,9 @@ def test_of_two_vessels_in_one_surface_the_one_at_the_point_given_is_taken(tmp_p
     vertices = np.concatenate([wide.vertices_mm, np.add(thin.vertices_mm, [30.0, 0, 0])])
     faces = np.concatenate([wide.faces, thin.faces + len(wide.vertices_mm)])
     write_stl(tmp_path / "both.stl", Surface(vertices, faces))
-    settings = Settings(input=InputSettings(units="mm"))
+    settings = settings_of()
     assert stages._vessel(tmp_path / "both.stl", settings).lumen.vertices_mm[:, 0].max() < 3.0
-    settings = replace(settings, **{given: (30.0, 0.0, 0.0)})
+    settings = replace(settings, anatomy=AnatomySettings(**{given: (30.0, 0.0, 0.0)}))
     assert stages._vessel(tmp_path / "both.stl", settings).lumen.vertices_mm[:, 0].min() > 27.0
 
 
@@ -330,22 +339,22 @@ def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(
     assert computed == ["bare", "silk", "silk"]
     metrics = json.loads((out / "metrics.json").read_text())
     # The second run was handed the bare flow: nothing changed, and every ratio is 1.
-    ratios, bare = metrics["treatments"]["silk"]["change"], metrics["treatments"]["bare"]["flow"]
-    assert ratios["neck_inflow_mL_s_ratio"] == pytest.approx(1.0)
-    assert bare["neck_inflow_mL_s"] == pytest.approx(bare["neck_outflow_mL_s"], rel=0.1)
+    bare, silk = (metrics["treatments"][name] for name in ("bare", "silk"))
+    assert silk["change"]["neck_inflow_mL_s_ratio"] == pytest.approx(1.0)
+    assert bare["flow"]["neck_inflow_mL_s"] == pytest.approx(bare["flow"]["neck_outflow_mL_s"], rel=0.1)
     report = (out / "report.html").read_text()
     assert all(f"Flow, {name}: The flow has " in report for name in ("bare", "silk"))
-    left = bare["unsettled_fraction"]
+    left = bare["flow"]["unsettled_fraction"]
     assert (left < 0.01) == ("Flow, bare: The flow has converged" in report)
-    assert metrics["treatments"]["silk"]["flow"]["unsettled_fraction"] == left > 0
-    assert not any("unsettled" in key for key in ratios)
+    assert silk["flow"]["unsettled_fraction"] == left > 0
+    assert not any("unsettled" in key for key in silk["change"])
     provenance = json.loads((out / "run.json").read_text())
     assert len(provenance["input"]["sha256"]) == 64
     assert {"numpy", "vstent", "python"} <= set(provenance["versions"])
 
 
 def test_on_a_gpu_a_flow_is_stored_while_the_next_is_computed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = Settings(treatments=(with_device("silk"),), flow=FlowSettings(numerics=Numerics(device_gpu=True)))
+    settings = settings_of("silk", flow=FlowSettings(numerics=Numerics(device_gpu=True)))
     is_next_begun, threads, stored = Event(), set(), []
 
     def computed(case: str, *, start: object, **given: object) -> SimpleNamespace:
@@ -359,7 +368,7 @@ def test_on_a_gpu_a_flow_is_stored_while_the_next_is_computed(tmp_path: Path, mo
         stored.append((name, list(seconds)))
 
     def written(folder: Path, field: object) -> None:
-        stored.append(folder.relative_to(tmp_path / "treatments").as_posix())
+        stored.append(folder.relative_to(tmp_path).as_posix())
 
     monkeypatch.setattr("numba.threading_layer", lambda: "omp")
     monkeypatch.setattr(stages, "_plan", lambda *_: None)
@@ -367,16 +376,17 @@ def test_on_a_gpu_a_flow_is_stored_while_the_next_is_computed(tmp_path: Path, mo
     monkeypatch.setattr(stages, "simulate_case", computed)
     monkeypatch.setattr(stages, "write_field", written)
     monkeypatch.setattr(Store, "_keep", write)
-    silk = SimpleNamespace(stent=SimpleNamespace(name="silk", design=find_design("silk")))
-    store = Store(tmp_path / "cache")
-    fields, failures = stages.compute_flows(
-        tmp_path, None, {"silk": {"silk": silk}}, settings, store, study_keys("", settings)
-    )
+    silk = {"silk": SimpleNamespace(stent=SimpleNamespace(name="silk"))}
+    store, keys = Store(tmp_path / "cache"), study_keys("", settings)
+    fields, failures = stages.compute_flows(tmp_path, None, {"silk": silk}, settings, store, keys)
     assert not failures
     assert fields["silk"].start is fields["bare"]
     assert get_ident() not in threads
     # The run time stored with a flow is its own, though the next one was begun before it was stored.
-    assert stored == [("flow bare", ["flow bare"]), "bare/flow", ("flow silk", ["flow silk"]), "silk/flow"]
+    assert stored == [
+        *(("flow bare", ["flow bare"]), "treatments/bare/flow"),
+        *(("flow silk", ["flow silk"]), "treatments/silk/flow"),
+    ]
 
 
 def test_a_device_whose_wires_change_does_not_get_the_flow_of_the_former(
@@ -392,9 +402,9 @@ def test_a_device_whose_wires_change_does_not_get_the_flow_of_the_former(
         return start if start is not None else real(case, start=start, **given)
 
     monkeypatch.setattr(stages, "simulate_case", computed_once)
-    settings = Settings(treatments=(with_device("silk"),), flow=FlowSettings(numerics=Numerics(cell_size_mm=0.35)))
+    settings = settings_of("silk", flow=FlowSettings(numerics=Numerics(cell_size_mm=0.35)))
     run(artery, out, settings, lambda *_: None)
-    for module in ("pipeline", "keys"):
+    for module in ("stages", "keys"):
         monkeypatch.setattr(f"vstent.study.{module}.find_design", lambda _: replace(design, wires=((48, 40.0),)))
     run(artery, out, settings, lambda *_: None)
     run(artery, out, settings, lambda *_: None)
@@ -402,17 +412,12 @@ def test_a_device_whose_wires_change_does_not_get_the_flow_of_the_former(
 
 
 def test_what_has_changed_is_written_again_and_nothing_else(arteries: tuple[Path, Path], tmp_path: Path) -> None:
-    out, settings = (
-        tmp_path / "out",
-        Settings(
-            treatments=(with_device("silk"), with_device("enterprise")), input=InputSettings(units="mm"), flow=None
-        ),
-    )
+    out, settings = tmp_path / "out", settings_of("silk", "enterprise")
     first = run(arteries[0], out, settings, lambda *_: None)
     files = {path: path.read_bytes() for path in out.glob("treatments/*/implants/*/*")}
     dates = {path: path.stat().st_mtime_ns for path in files}
-    (out / "treatments/silk/implants/silk/struts.stl").write_text("of the user")
-    (out / "treatments/enterprise/implants/enterprise/wires.vtp").unlink()
+    implant_folder(out, "silk", "silk").joinpath("struts.stl").write_text("of the user")
+    implant_folder(out, "enterprise", "enterprise").joinpath("wires.vtp").unlink()
     (measured,) = (out / ".vstent").glob("measure-*.json")
     measured.write_text("{damaged")
     second = run(arteries[0], out, settings, lambda *_: None)
@@ -422,9 +427,8 @@ def test_what_has_changed_is_written_again_and_nothing_else(arteries: tuple[Path
     third = run(arteries[0], out, settings, lambda *_: None)
     assert list(third.metrics["treatments"]) == list(first.metrics["treatments"]) == ["silk", "enterprise"]
     assert third.metrics == json.loads(json.dumps(second.metrics)) == json.loads(json.dumps(first.metrics))
-    np.testing.assert_array_equal(
-        third.implants["silk"]["silk"].stent.nodes_mm, first.implants["silk"]["silk"].stent.nodes_mm
-    )
+    before, after = (case.implants["silk"]["silk"].stent.nodes_mm for case in (first, third))
+    np.testing.assert_array_equal(after, before)
     dates = {path: path.stat().st_mtime_ns for path in files}
     run(arteries[0], out, settings, lambda *_: None)
     assert {path: path.stat().st_mtime_ns for path in files} == dates
