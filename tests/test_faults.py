@@ -49,10 +49,11 @@ def test_a_fault_ends_in_one_sentence_and_leaves_nothing_behind(
 
 KILLED = """
 import os, pathlib, signal, sys
+from vstent.devices.treatment import with_device
 from vstent.flow import engines
-from vstent.flow.case import FlowSettings
+from vstent.flow.settings import FlowSettings, Numerics
 from vstent.study.pipeline import run
-from vstent.study.settings import Settings
+from vstent.study.settings import InputSettings, Settings
 
 moment, path, out = sys.argv[1:]
 replace = os.replace
@@ -66,11 +67,10 @@ def replacing(source, target):
     replace(source, target)
 
 os.replace = replacing
-from vstent.flow.settings import FlowSettings, Numerics
 engines.SAVE_EVERY_S = 0.0
 flow = FlowSettings(inflow_mL_s=2.0, numerics=Numerics(cell_size_mm=0.45, max_steps=400))
-settings = Settings(treatments=(with_device("silk"),), input=InputSettings(units="mm"), flow=flow)
-run(pathlib.Path(path), pathlib.Path(out), settings, lambda stage, fraction, detail: die(f"{stage} {fraction:.0f}"))
+settings = Settings(InputSettings("mm"), treatments=(with_device("silk"),), flow=flow)
+run(pathlib.Path(path), pathlib.Path(out), settings, lambda now: die(f"{now.stage} {now.fraction:.0f}"))
 """
 """A study that kills itself, without a chance to tidy up, at a moment given: a stage's begin (0) or end (1)."""
 

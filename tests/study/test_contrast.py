@@ -40,7 +40,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
 
 
 def bare(case: Path) -> dict[str, float]:
-    return dict(json.loads((case / "metrics.json").read_text())["bare"])
+    return dict(json.loads((case / "metrics.json").read_text())["treatments"]["bare"]["flow"])
 
 
 def test_an_angiogram_is_written_kept_and_not_computed_twice(

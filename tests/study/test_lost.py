@@ -17,15 +17,15 @@ from vstent.flow.settings import FlowSettings, Numerics
 from vstent.geometry.surface import Surface
 from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_stl
+from vstent.plan.ranges import Ranges
 from vstent.plan.rank import rank
-from vstent.plan.uncertainty import Ranges
 from vstent.study import stages
 from vstent.study.folder import CACHE, INPUT
 from vstent.study.keys import implant_keys, study_keys
 from vstent.study.outputs import write_ranking
 from vstent.study.pipeline import refine_flow, restore_vessel, run, trace_vessel
-from vstent.study.store import Key
 from vstent.study.settings import AnatomySettings, InputSettings, Settings
+from vstent.study.store import Key
 
 FLOW = FlowSettings(inflow_mL_s=2.0, numerics=Numerics(cell_size_mm=0.5, max_steps=20))
 

@@ -31,9 +31,9 @@ from vstent.study.folder import implant_folder
 from vstent.study.keys import hash_of, study_keys
 from vstent.study.outputs import write_anatomy
 from vstent.study.pipeline import restore_vessel, run
+from vstent.study.settings import AnatomySettings, InputSettings, Settings
 from vstent.study.stages import deploy_implant, engine_folders, size_of
 from vstent.study.store import Key, Store
-from vstent.study.settings import AnatomySettings, InputSettings, Settings
 
 
 def test_every_sac_has_its_files_and_those_of_an_earlier_case_go(tmp_path: Path) -> None:
