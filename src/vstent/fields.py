@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from functools import reduce
 from pathlib import Path
 from typing import Any, Final, get_args
 
@@ -104,6 +105,8 @@ class Option:
     """Highest value."""
     above: float = -math.inf
     """Number that every value exceeds."""
+    counts: tuple[int, int] | None = None
+    """Lowest and highest number of points; None: any."""
     remark: str = ""
     """A conversion into the unit, such as 240 mL/min are 4 mL/s."""
     choices: tuple[str, ...] = ()
@@ -126,6 +129,8 @@ class Option:
     @property
     def limits(self) -> str:
         """The permitted values as text, with their unit."""
+        if self.low == self.above == -self.high:
+            return ""
         is_open = self.above > self.low
         said = f"above {self.above:g}" if is_open else f"{self.low:g}"
         if math.isinf(self.high):
@@ -144,9 +149,7 @@ class Option:
         """
         if self.choices and text not in self.choices:
             raise InputError(f"{text!r} is not one of {', '.join(self.choices)}")
-        found = self.read(text)
-        self.check(found)
-        return found
+        return self.check(self.read(text))
 
     def cell(self, text: str, folder: Path) -> Any:
         """Return a value, or several, read from a cell of a table.
@@ -165,15 +168,28 @@ class Option:
             return tuple(self.value(part.strip()) for part in re.split(f"[{self.separators}]", text) if part.strip())
         return self.value(str(folder / text) if self.is_file and text != self.alone else text)
 
-    def check(self, value: Any) -> None:
-        """Raise InputError where a number, or one of several, is outside the limits."""
-        for one in value if isinstance(value, tuple | list) else [value]:
-            if isinstance(one, tuple | list):
-                self.check(one)
-            elif isinstance(one, int | float) and not (
-                self.low <= one <= self.high and self.above < one and math.isfinite(one)
-            ):
-                raise InputError(f"{one:g} {self.unit}".rstrip() + f" is out of range: give {self.limits}")
+    def check(self, value: Any) -> Any:
+        """Return a value.
+
+        Raises
+        ------
+        InputError
+            A number is outside the limits, or there are too many or too few points.
+        """
+        if not isinstance(value, tuple | list):
+            is_bad = isinstance(value, int | float) and not (
+                self.low <= value <= self.high and self.above < value and math.isfinite(value)
+            )
+            if is_bad:
+                raise InputError(f"{value:g} {self.unit}".rstrip() + f" is out of range: give {self.limits}")
+            return value
+        if self.counts and not (value and isinstance(value[0], int | float)):
+            fewest, most = self.counts
+            if not fewest <= len(value) <= most:
+                raise InputError(f"{len(value)} points are given: give {fewest} to {most}")
+        for one in value:
+            self.check(one)
+        return value
 
 
 def setting(default: Any, name: str, text: str, read: Callable[[str], Any] = number, **more: Any) -> Any:
@@ -206,3 +222,22 @@ def stated(kind: type) -> dict[str, Option]:
 def sections_of(kind: Any) -> list[Any]:
     """Return the data classes that a type, an optional type or a tuple consists of."""
     return [one for one in (kind, *get_args(kind)) if is_dataclass(one)]
+
+
+def at(section: Any, path: str) -> Any:
+    """Return the setting at a dotted path of a data class."""
+    return reduce(getattr, path.split("."), section)
+
+
+def check_all(section: Any) -> None:
+    """Raise InputError where a setting of a data class, or of those in it, is outside its limits."""
+    for path, option in stated(type(section)).items():
+        try:
+            option.check(at(section, path))
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+
+
+def differing(one: Any, other: Any) -> list[str]:
+    """Return the names of the options whose settings differ between two data classes of one kind."""
+    return [option.name for path, option in stated(type(one)).items() if at(one, path) != at(other, path)]

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from stated import NECK, STATED, needed
 
 from vstent import phantoms
 from vstent.cli import main
@@ -24,23 +25,20 @@ from vstent.cohort.batch import collect, left_to_do, run_cohort
 from vstent.cohort.cases import COLUMNS, find_cases
 from vstent.cohort.estimate import START_CPU_S, estimate
 from vstent.cohort.work import COST, LOST, flat_metrics, read_row, row_path, work
-from vstent.devices.treatment import read_treatment, with_device
+from vstent.devices.treatment import with_device
 from vstent.errors import FlowError, InputError, ReadError, VstentError
-from vstent.flow.settings import Blood, CarreauYasuda, FlowSettings, Numerics
-from vstent.flow.waveform import OLDER_ADULT_ICA
-from vstent.io.tables import write_parquet
+from vstent.flow.settings import FlowSettings
+from vstent.io.tables import write_parquet, write_rows
 from vstent.io.writers import write_stl
-from vstent.plan.ranges import Ranges
 from vstent.reporting.cohort import cohort_report, modified_z_scores
 from vstent.study.crews import DaskCluster, Processes, Slurm
 from vstent.study.pipeline import run as run_study
-from vstent.study.settings import AnatomySettings, InputSettings, Settings, settings_of
+from vstent.study.settings import AnatomySettings, InputSettings, settings_of
 
 TREATMENTS = (with_device("silk"), with_device("enterprise", center_mm=27.0))
 """The Enterprise within an artery of 44 mm, beyond the end of one of 11 mm that is continued to 31.5 mm."""
 GIVEN = {"treatment": TREATMENTS, "no-flow": True, "units": "mm"}
 SETTINGS = settings_of(GIVEN)
-USUAL = ("silk", "enterprise")
 
 needs_dask = pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="Dask is not installed")
 
@@ -259,66 +257,20 @@ def test_a_bad_list_is_refused_before_anything_is_done(name, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-CELLS = {
-    "units": ("cm", Settings(InputSettings(units="cm"))),
-    "frame": ("ras", Settings(InputSettings(frame="ras"))),
-    "acquisition": ("2", Settings(InputSettings(acquisition=2))),
-    "spacing": ("0.1 0.2 0.3", Settings(InputSettings(spacing_mm=(0.1, 0.2, 0.3)))),
-    "shape": ("5 6 7", Settings(InputSettings(shape=(5, 6, 7)))),
-    "crop": ("0 0 0 1 2 3", Settings(InputSettings(crop_mm=((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))))),
-    "threshold": ("-5.5", Settings(InputSettings(threshold=-5.5))),
-    "at": ('"-1.5, 0; 3"', Settings(anatomy=AnatomySettings(at_mm=(-1.5, 0.0, 3.0)))),
-    "inlet": ("1 2 3; 4 5 -6", Settings(anatomy=AnatomySettings(inlet_mm=((1.0, 2.0, 3.0), (4.0, 5.0, -6.0))))),
-    "outlet": ("1 2 3", Settings(anatomy=AnatomySettings(outlet_mm=(1.0, 2.0, 3.0)))),
-    "neck": ("neck.csv", Settings(anatomy=AnatomySettings(neck_mm=((1.0, 2.0, 3.0), (4.0, 5.0, 6.0))))),
-    "upstream": ("9", Settings(anatomy=AnatomySettings(upstream_mm=9.0))),
-    "downstream": ("8", Settings(anatomy=AnatomySettings(downstream_mm=8.0))),
-    "treatment": (
-        "two=silk 4x20 + silk@-4; pipeline",
-        Settings(treatments=(read_treatment("two=silk 4x20 + silk@-4"), with_device("pipeline"))),
-    ),
-    "device": ("silk pipeline", Settings(treatments=(with_device("silk"), with_device("pipeline")))),
-    "diameter": ("4.5", Settings(treatments=tuple(with_device(one, diameter_mm=4.5) for one in USUAL))),
-    "length": ("20", Settings(treatments=tuple(with_device(one, length_mm=20.0) for one in USUAL))),
-    "center": ("-2", Settings(treatments=tuple(with_device(one, center_mm=-2.0) for one in USUAL))),
-    "no-flow": ("yes", Settings(flow=None)),
-    "flow-rate": ("4.5", Settings(flow=FlowSettings(inflow_mL_s=4.5))),
-    "density": ("1050", Settings(flow=FlowSettings(blood=Blood(1050.0)))),
-    "viscosity": ("0.0035", Settings(flow=FlowSettings(blood=Blood(viscosity_Pa_s=0.0035)))),
-    "shear-thinning": ("yes", Settings(flow=FlowSettings(blood=Blood(1060.0, 0.00345, CarreauYasuda())))),
-    "pulsatile": ("published", Settings(flow=FlowSettings(waveform=OLDER_ADULT_ICA))),
-    "steady": ("yes", Settings()),
-    "outlets": ("murray", Settings(flow=FlowSettings(outlets="murray"))),
-    "grid-spacing": ("0.2", Settings(flow=FlowSettings(numerics=Numerics(cell_size_mm=0.2)))),
-    "refine-sac": ("true", Settings(flow=FlowSettings(numerics=Numerics(close_up=True)))),
-    "engine": ("openfoam", Settings(flow=FlowSettings(numerics=Numerics(engine="openfoam")))),
-    "processes": ("2", Settings(flow=FlowSettings(numerics=Numerics(processes=2)))),
-    "gpu": ("no", Settings()),
-    "uncertainty": ("8", Settings(uncertainty=Ranges(8))),
-    "uncertainty-flows": ("2", Settings(uncertainty=Ranges(8, 2))),
-    "vary-threshold": ("0.2", Settings(uncertainty=Ranges(8, threshold_mm=0.2))),
-    "vary-landing": ("2", Settings(uncertainty=Ranges(8, landing_mm=2.0))),
-    "vary-device": ("0", Settings(uncertainty=Ranges(8, device_mm=0.0))),
-    "vary-inflow": ("0.1", Settings(uncertainty=Ranges(8, inflow_fraction=0.1))),
-    "vary-numbers": ("0.5", Settings(uncertainty=Ranges(8, numbers_factor=0.5))),
-}
-"""A cell of every column, and the settings that it gives where nothing else is stated."""
+def test_the_columns_are_the_options():
+    assert sorted(COLUMNS) == sorted(["case", "input", *STATED])
 
 
-@pytest.mark.parametrize("column", COLUMNS)
-def test_every_option_is_a_column_that_reaches_its_setting(column, tmp_path):
-    if column in ("case", "input"):
-        return
-    (tmp_path / "neck.csv").write_text("1,2,3\n4,5,6\n")
-    cell, expected = CELLS[column]
-    (tmp_path / "list.csv").write_text(f"case,input,{column}\nfirst,a.stl,{cell}\nlast,a.stl,\n")
-    given = {"uncertainty": 8} if column.startswith(("vary", "uncertainty-")) else {}
-    given |= {"pulsatile": "published"} if column == "steady" else {}
-    given |= {"gpu": False, "no-flow": False}
-    first, last = find_cases(tmp_path / "list.csv", given)
+@pytest.mark.parametrize("column", STATED)
+def test_a_cell_reaches_its_setting(column, tmp_path, monkeypatch):
+    monkeypatch.setattr("vstent.cohort.cases.check_engine", lambda flow: None)  # there may be no GPU
+    (tmp_path / "neck.csv").write_text(NECK)
+    text, expected = STATED[column]
+    rows = [{"input": "a.stl", "case": "first", column: text}, {"input": "a.stl", "case": "last"}]
+    write_rows(tmp_path / "list.csv", rows)
+    first, last = find_cases(tmp_path / "list.csv", needed(column))
     assert first.settings == expected
-    assert last.settings == settings_of(given)  # an empty cell takes what holds for all
-    assert first.settings != last.settings or column == "gpu"
+    assert last.settings == settings_of(needed(column)) != expected  # an empty cell takes what holds for all
 
 
 def test_a_row_joins_what_it_states_to_what_holds_for_all(tmp_path):

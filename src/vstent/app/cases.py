@@ -10,7 +10,7 @@ from collections.abc import Iterator, Set
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -18,9 +18,7 @@ from vstent.app.choices import Choices
 from vstent.errors import InputError, ReadError
 from vstent.io.files import atomic
 from vstent.study.folder import refuse_older
-
-if TYPE_CHECKING:  # imported when a study's settings are needed, as in `vstent.app.choices`
-    from vstent.study.settings import Settings
+from vstent.study.settings import Settings
 
 STATE: Final = "app.json"
 """File of a case folder that stores the page's state."""
@@ -73,7 +71,7 @@ class State(BaseModel):
     job: str = ""
     """Kind of the running job, also after the server was killed."""
 
-    def former_settings(self) -> "Settings":
+    def former_settings(self) -> Settings:
         """Return the settings that the page cannot change.
 
         Raises
@@ -82,7 +80,6 @@ class State(BaseModel):
             They belong to a study of another version.
         """
         from vstent.study.repeat import settings_of
-        from vstent.study.settings import Settings
 
         try:
             return settings_of(self.former) if self.former else Settings()
@@ -91,14 +88,12 @@ class State(BaseModel):
                 f"{self.name} was opened from a study of another version of vstent. Open its scan again."
             ) from None
 
-    def settings(self) -> "Settings":
+    def settings(self) -> Settings:
         """Return the settings of the study."""
         return self.choices.settings(self.former_settings())
 
     def unseen(self) -> list[str]:
         """Return the settings, with their values, that the page cannot change and that differ from its own."""
-        from vstent.study.settings import Settings
-
         return list(_differences(asdict(self.settings()), asdict(self.choices.settings(Settings()))))
 
 

@@ -1,27 +1,23 @@
 """The user's choices as the page and the REST interface state them, and their conversion to settings of a study."""
 
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Annotated, Final, Literal, Self, TypeVar
+from typing import Annotated, Any, Final, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model, field_validator, model_validator
 
-from vstent.devices.treatment import Treatment, with_device
+from vstent.devices.treatment import Treatment
+from vstent.errors import InputError
+from vstent.fields import POSITION, Option, check_all
+from vstent.flow.settings import FlowSettings, Numerics
+from vstent.flow.waveform import OLDER_ADULT_ICA, Waveform
+from vstent.plan.ranges import Ranges
+from vstent.study.settings import AnatomySettings, InputSettings, Settings
 
-if TYPE_CHECKING:  # imported only when the settings of a study are needed, so that the page appears at once
-    from vstent.flow.settings import FlowSettings
-    from vstent.flow.waveform import Waveform
-    from vstent.study.settings import AnatomySettings, InputSettings, Settings
-
-Part = TypeVar("Part", "InputSettings", "AnatomySettings")
-
-Coordinate = Annotated[float, Field(ge=-10_000, le=10_000, allow_inf_nan=False)]
-"""A coordinate or position in mm."""
-Length = Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
-"""A length in mm."""
-Count = Annotated[int, Field(gt=0, le=100_000)]
-"""A number of voxels."""
+Section = TypeVar("Section", InputSettings, AnatomySettings, FlowSettings, Numerics)
 NECK_HANDLES: Final = 12
 """Number of evenly spaced handles on a neck."""
+Coordinate = Annotated[float, Field(ge=POSITION["low"], le=POSITION["high"], allow_inf_nan=False)]
+"""A coordinate in mm."""
 Point = tuple[Coordinate, Coordinate, Coordinate]
 """A point in LPS mm."""
 
@@ -32,31 +28,72 @@ class Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class FlowChoice(Strict):
+def offered(kind: type, *without: str) -> dict[str, Any]:
+    """Return the fields of a model that state those settings of a data class that have an option.
+
+    Parameters
+    ----------
+    kind : the data class.
+    without : names of settings that are left out.
+    """
+    stated = [one for one in fields(kind) if "option" in one.metadata and one.name not in without]
+    return {one.name: (_limited(one.type, one.metadata["option"]), one.default) for one in stated}
+
+
+def _limited(kind: Any, option: Option) -> Any:
+    """Return the type of a field whose values are within the limits of an option."""
+
+    def check(value: Any) -> Any:
+        try:
+            return option.check(value)
+        except InputError as error:
+            raise InputError(f"{option.name.replace('-', ' ')}: {error}") from None
+
+    return Annotated[kind, AfterValidator(check), Field(description=f"{option.help}; {option.limits}".rstrip("; "))]
+
+
+def changed(former: Section, model: BaseModel) -> Section:
+    """Return a section of the settings with the values that a model states."""
+    names = {one.name for one in fields(former)} & type(model).model_fields.keys()
+    return replace(former, **{name: getattr(model, name) for name in names})
+
+
+def told(model: type[BaseModel], *sections: Any) -> dict[str, Any]:
+    """Return the settings of sections that a model states."""
+    return {name: getattr(one, name) for one in sections for name in model.model_fields if hasattr(one, name)}
+
+
+OfFlow: Any = create_model(
+    "OfFlow",
+    __base__=Strict,
+    **offered(FlowSettings, "waveform"),
+    **offered(Numerics, "close_up", "engine", "processes", "device_gpu"),
+)
+"""Settings of the flow that can be changed on the page."""
+OfVessel: Any = create_model(
+    "OfVessel", __base__=Strict, **offered(InputSettings, "acquisition"), **offered(AnatomySettings)
+)
+"""Settings of input and anatomy that can be changed on the page."""
+
+
+Samples: Any = offered(Ranges)["samples"][0]
+"""Number of samples of an uncertainty study."""
+
+
+class FlowChoice(OfFlow):
     """How the blood flow is computed."""
 
     is_wanted: bool = True
     """Whether a flow is computed."""
-    cell_size_mm: Annotated[float, Field(ge=0.04, le=1.0)] | None = None
-    """Grid spacing."""
-    inflow_mL_s: Annotated[float, Field(gt=0, le=50)] | None = None
-    """Mean inflow of all inlets."""
     is_pulsatile: bool = False
     """Whether the inflow is pulsatile."""
-    outlets: Literal["zero_pressure", "murray"] = "zero_pressure"
-    """Boundary condition at the outlets."""
 
-    def settings(self, former: "FlowSettings") -> "FlowSettings | None":
+    def settings(self, former: FlowSettings) -> FlowSettings | None:
         """Return the flow settings of the study; settings that the page cannot change are taken from `former`."""
         if not self.is_wanted:
             return None
-        return replace(
-            former,
-            inflow_mL_s=self.inflow_mL_s,
-            waveform=pulse_of(former) if self.is_pulsatile else None,
-            outlets=self.outlets,
-            numerics=replace(former.numerics, cell_size_mm=self.cell_size_mm),
-        )
+        waveform = pulse_of(former) if self.is_pulsatile else None
+        return replace(changed(former, self), waveform=waveform, numerics=changed(former.numerics, self))
 
 
 Unit = Annotated[float, Field(ge=-1.001, le=1.001, allow_inf_nan=False)]
@@ -96,40 +133,16 @@ class ColourRange(Strict):
         return self
 
 
-class Choices(Strict):
+class Choices(OfVessel):
     """All choices of the user; missing values are proposed."""
 
-    units: Literal["m", "cm", "mm"] | None = None
-    """Length unit of a surface file."""
-    frame: Literal["lps", "ras"] | None = None
-    """Frame of a surface file; None: as it states, else LPS."""
-    spacing_mm: tuple[Length, Length, Length] | None = None
-    """Voxel spacing of a raw volume."""
-    shape: tuple[Count, Count, Count] | None = None
-    """Number of voxels of a raw volume."""
-    crop_mm: tuple[Point, Point] | None = None
-    """Opposite corners of the box to which a scan is cropped."""
-    threshold: Annotated[float, Field(allow_inf_nan=False)] | None = None
-    """Intensity at the lumen wall of a scan."""
-    at_mm: Point | None = None
-    """Point near the sac."""
-    inlet_mm: Point | Annotated[tuple[Point, ...], Field(min_length=1, max_length=50)] | None = None
-    """Point near the inlet, or near each inlet; the parent artery begins at the first."""
-    outlet_mm: Point | None = None
-    """Point near the outlet of the parent artery."""
-    neck_mm: Annotated[tuple[Point, ...], Field(min_length=3, max_length=1000)] | None = None
-    """Neck drawn by hand: a closed curve near the wall."""
-    upstream_mm: Length | None = None
-    """Length of artery to keep proximal to the sac."""
-    downstream_mm: Length | None = None
-    """Length of vessel to keep distal to the sac."""
-    treatments: tuple[Treatment, ...] = Field(default=(with_device("silk"), with_device("enterprise")), max_length=3)
+    treatments: tuple[Treatment, ...] = Field(default=Settings.treatments, max_length=3)
     """Treatments to compare, each under a name of its own; one of a single device has the name of the device."""
     flow: FlowChoice = FlowChoice()
     """Settings of the flow."""
     ranking_flows: Annotated[int, Field(ge=1, le=24)] | None = None
     """Number of best sizes of a ranking that get a flow; None: none."""
-    uncertainty_samples: Annotated[int, Field(ge=8, le=256)] | None = None
+    uncertainty_samples: Samples | None = None
     """Number of deployments with uncertain inputs varied; None: none."""
     views: Annotated[tuple[SavedView, ...], Field(max_length=12)] = ()
     """Views that were saved; no result depends on them."""
@@ -142,33 +155,42 @@ class Choices(Strict):
         """Return the treatments; ValueError is raised where two have the same name, or one has no implant."""
         if len({treatment.name for treatment in treatments}) < len(treatments):
             raise ValueError("a device can be chosen only once")
-        if not all(treatment.implants for treatment in treatments):
-            raise ValueError("a treatment needs an implant")
+        for treatment in treatments:
+            if not treatment.implants:
+                raise ValueError("a treatment needs an implant")
+            for implant in treatment.implants:
+                check_all(implant)
         return treatments
 
-    def settings(self, former: "Settings") -> "Settings":
+    def settings(self, former: Settings) -> Settings:
         """Return the settings of the study; settings that the page cannot change are taken from `former`."""
-        from vstent.flow.settings import FlowSettings
-        from vstent.plan.ranges import Ranges
-
         samples = self.uncertainty_samples
         return replace(
             former,
-            input=self._changed(former.input),
-            anatomy=self._changed(former.anatomy),
+            input=changed(former.input, self),
+            anatomy=changed(former.anatomy, self),
             treatments=self.treatments,
             flow=self.flow.settings(former.flow or FlowSettings()),
             uncertainty=None if samples is None else replace(former.uncertainty or Ranges(), samples=samples),
         )
 
-    def _changed(self, former: Part) -> Part:
-        """Return a part of the settings with the fields that can be chosen on the page."""
-        names = {field.name for field in fields(former)} & type(self).model_fields.keys()
-        return replace(former, **{name: getattr(self, name) for name in names})
+    @classmethod
+    def of(cls, settings: Settings) -> Self:
+        """Return the settings of a study that can be changed on the page.
+
+        Raises
+        ------
+        ValidationError, InputError
+            The page does not support a setting.
+        """
+        flow, varied = settings.flow, settings.uncertainty
+        chosen = told(cls, settings.input, settings.anatomy)
+        chosen |= {"treatments": settings.treatments, "flow": {"is_wanted": False}}
+        if flow is not None:
+            chosen["flow"] = told(FlowChoice, flow, flow.numerics) | {"is_pulsatile": flow.waveform is not None}
+        return cls.model_validate(chosen | {"uncertainty_samples": None if varied is None else varied.samples})
 
 
-def pulse_of(former: "FlowSettings") -> "Waveform":
+def pulse_of(former: FlowSettings) -> Waveform:
     """Return the waveform that can be chosen: that of the study the case was opened from, or the published one."""
-    from vstent.flow.waveform import OLDER_ADULT_ICA
-
     return former.waveform or OLDER_ADULT_ICA

@@ -87,7 +87,9 @@ def add_settings(parser: argparse.ArgumentParser, *sections: str, without: Conta
 def given(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the values of the options of the settings, by name; only those that are given."""
     values = {name: getattr(arguments, name.replace("-", "_"), None) for name in OPTIONS}
-    return {name: value for name, value in values.items() if value is not None}
+    return {
+        name: tuple(value) if isinstance(value, list) else value for name, value in values.items() if value is not None
+    }
 
 
 def given_settings(arguments: argparse.Namespace, **usual: Any) -> Settings:

@@ -6,8 +6,7 @@ This module imports no numpy, so that command-line options and settings of a stu
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from vstent.errors import InputError
-from vstent.fields import setting, stated, whole
+from vstent.fields import check_all, setting, whole
 
 if TYPE_CHECKING:
     from vstent.devices.design import Design, Range
@@ -20,7 +19,14 @@ class Ranges:
     """Range of each cause and number of samples. The default ranges are vstent's own."""
 
     samples: int = setting(
-        32, "uncertainty", "deploy N times with uncertain inputs varied", whole, metavar="N", usual="off", low=2
+        32,
+        "uncertainty",
+        "deploy N times with uncertain inputs varied",
+        whole,
+        metavar="N",
+        usual="off",
+        low=2,
+        high=4096,
     )
     """Number of deployments, rounded up to a power of two."""
     flow_samples: int = setting(
@@ -62,11 +68,7 @@ class Ranges:
     """Factor, 0 to 1, of the ranges of the device's numbers in the catalogue; 0 leaves them out."""
 
     def __post_init__(self) -> None:
-        for name, option in stated(Ranges).items():
-            try:
-                option.check(getattr(self, name))
-            except InputError as error:
-                raise InputError(f"{name} of an uncertainty study: {error}") from None
+        check_all(self)
 
     def of(self, anatomy: "Anatomy") -> "Floats":
         """Return the ranges (4,) of threshold, landing, device and inflow."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from vstent.devices.stent import Stent
 from vstent.errors import FlowError, InputError
+from vstent.fields import differing
 from vstent.flow.case import FlowCase
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.openfoam import program
@@ -24,7 +25,7 @@ from vstent.study.folder import CACHE, RUN
 from vstent.study.keys import anatomy_keys, hash_of
 from vstent.study.progress import OnProgress
 from vstent.study.repeat import finished_run
-from vstent.study.settings import AnatomySettings, InputSettings, Settings, differing
+from vstent.study.settings import AnatomySettings, InputSettings, Settings
 from vstent.study.stages import check_inflow, deploy_implant, find_anatomy
 from vstent.study.store import Store
 

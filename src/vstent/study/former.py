@@ -12,10 +12,11 @@ from typing import Any, Final
 
 from vstent.devices.treatment import Treatment
 from vstent.errors import InputError
+from vstent.fields import differing
 from vstent.io.writers import write_json
 from vstent.study.folder import CACHE, RUN
 from vstent.study.repeat import former_source, settings_of
-from vstent.study.settings import Settings, differing
+from vstent.study.settings import Settings
 from vstent.study.store import UNREADABLE
 
 BEGUN: Final = "settings.json"

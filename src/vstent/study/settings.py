@@ -119,6 +119,7 @@ class AnatomySettings:
         point,
         usual="the widest opening",
         separators=";",
+        counts=(1, 50),
         **PLACE,
     )
     """Point near the inlet, or near each inlet; the parent artery begins at the first."""
@@ -131,6 +132,7 @@ class AnatomySettings:
         str,
         load=_read_neck,
         is_file=True,
+        counts=(3, 1000),
         **PLACE | {"metavar": "CSV"},
     )
     """Neck drawn by hand: a closed curve near the wall around the mouth of the sac."""
@@ -225,7 +227,9 @@ def _section(kind: Any, given: Mapping[str, Any]) -> Any:
     for one in fields(kind):
         option: Option | None = one.metadata.get("option")
         if option is not None and option.name in given:
-            value = option.load(given[option.name]) if option.load else given[option.name]
+            value = given[option.name]
+            if option.load:
+                value = option.check(option.load(value))
             values[one.name] = _from_ras(value) if option.is_place and given.get("frame") == "ras" else value
         elif option is None and sections_of(one.type):
             values[one.name] = _section(sections_of(one.type)[0], given)
@@ -247,15 +251,3 @@ def _from_ras(place_mm: Any) -> Any:
     if isinstance(place_mm[0], tuple):
         return tuple(map(_from_ras, place_mm))
     return -place_mm[0], -place_mm[1], place_mm[2]
-
-
-def differing(one: Any, other: Any) -> list[str]:
-    """Return the names of the options whose settings differ between two sections of one kind."""
-    return [option.name for path, option in stated(type(one)).items() if _at(one, path) != _at(other, path)]
-
-
-def _at(section: Any, path: str) -> Any:
-    """Return the setting at a dotted path."""
-    for name in path.split("."):
-        section = getattr(section, name)
-    return section
