@@ -148,7 +148,8 @@ def test_without_a_sac_restore_says_so_and_leaves_none_of_another_case(
 
 
 def _complaint(capsys: pytest.CaptureFixture[str], said: str) -> bool:
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("vstent: ")]
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("vstent: ")]
+    (line,) = [line for line in lines if "compiling its kernels" not in line]
     return said in line
 
 
@@ -212,7 +213,7 @@ def test_a_number_may_begin_with_a_minus() -> None:
         (["--viscosity", "4"], "4 mPa s are 0.004"),
         (["--viscosity", "1e-6"], "Pa s"),
         (["--density", "1.06"], "1.06 g/mL are 1060"),
-        (["--flow-rate", "40"], "240 mL/min are 4"),
+        (["--flow-rate", "240"], "240 mL/min are 4"),
         (["--grid-spacing", "200"], "200 mm is out of range: give 0.04 to 1 mm"),
     ],
 )
