@@ -105,9 +105,10 @@ def ages(name: str, case: FlowCase, field: FlowField) -> None:
     wall, cpu = time.perf_counter() - began, time.process_time() - busy
     print(
         f"{name:24} {len(field.centers_mm):8,} cells  corrected {grid.network.correction_fraction:.2%}  "
-        f"volume / inflow {told_s:.4f} s, in the mean flow {volume_mm3 / inflow_mm3_s:.4f} s  branch {1e-3 * branch_mm3_s:.3f} of "
-        f"{1e-3 * inflow_mm3_s:.3f} mL/s ({carried_mm3_s / inflow_mm3_s - 1:+.1%} in the transport)  age on leaving "
-        f"{leaving_mm3 / inflow_mm3_s:.4f} s ({leaving_mm3 / volume_mm3 - 1:+.1%})  "
+        f"volume / inflow {told_s:.4f} s, in the mean flow {volume_mm3 / inflow_mm3_s:.4f} s  "
+        f"branch {1e-3 * branch_mm3_s:.3f} of {1e-3 * inflow_mm3_s:.3f} mL/s "
+        f"({carried_mm3_s / inflow_mm3_s - 1:+.1%} in the transport)  "
+        f"age on leaving {leaving_mm3 / inflow_mm3_s:.4f} s ({leaving_mm3 / volume_mm3 - 1:+.1%})  "
         f"mean age {found.mean_age_s:.4f} s (extrapolated "
         f"{found.tail_fraction:.1%})  {wall:.0f} s ({cpu:.0f} s CPU)",
         flush=True,
