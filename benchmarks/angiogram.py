@@ -104,10 +104,11 @@ def ages(name: str, case: FlowCase, field: FlowField) -> None:
     told_s = indices(field, case.sac, case.ostium)["turnover_time_s"]
     wall, cpu = time.perf_counter() - began, time.process_time() - busy
     print(
-        f"{name:24} {len(field.cells):8,} cells  corrected {grid.network.correction_fraction:.2%}  volume / inflow "
-        f"{told_s:.4f} s, in the mean flow {volume_mm3 / inflow_mm3_s:.4f} s  branch {1e-3 * branch_mm3_s:.3f} of "
-        f"{1e-3 * inflow_mm3_s:.3f} mL/s ({carried_mm3_s / inflow_mm3_s - 1:+.1%} in the transport)  age on leaving "
-        f"{leaving_mm3 / inflow_mm3_s:.4f} s ({leaving_mm3 / volume_mm3 - 1:+.1%})  "
+        f"{name:24} {len(field.centers_mm):8,} cells  corrected {grid.network.correction_fraction:.2%}  "
+        f"volume / inflow {told_s:.4f} s, in the mean flow {volume_mm3 / inflow_mm3_s:.4f} s  "
+        f"branch {1e-3 * branch_mm3_s:.3f} of {1e-3 * inflow_mm3_s:.3f} mL/s "
+        f"({carried_mm3_s / inflow_mm3_s - 1:+.1%} in the transport)  "
+        f"age on leaving {leaving_mm3 / inflow_mm3_s:.4f} s ({leaving_mm3 / volume_mm3 - 1:+.1%})  "
         f"mean age {found.mean_age_s:.4f} s (extrapolated "
         f"{found.tail_fraction:.1%})  {wall:.0f} s ({cpu:.0f} s CPU)",
         flush=True,
@@ -129,9 +130,8 @@ def _through_branch(near: Network, sac: Ints, through: Floats, case: FlowCase) -
 def _inflow_mL_s(case: FlowCase, field: FlowField) -> float:
     """Return the inflow through the ostium in the velocity of a flow."""
     assert case.ostium is not None
-    points_mm, area_mm2 = sampling.surface_samples(case.ostium, field.cell_size_mm)
-    points = (points_mm - field.origin_mm) / field.cell_size_mm
-    return sampling.inflow_mL_s(sampling.read_through_mL_s(field.index, field.velocity_m_s, points, area_mm2))
+    samples = sampling.surface_samples(case.ostium, field.finest.cell_size_mm)
+    return sampling.inflow_mL_s(sampling.through_surface_mL_s(field, *samples))
 
 
 def _at_ostium(case: FlowCase, field: FlowField, near: Network, through: Floats) -> Floats:
@@ -140,14 +140,15 @@ def _at_ostium(case: FlowCase, field: FlowField, near: Network, through: Floats)
     Per area it is linear between the centers of the faces across one axis, and 0 on faces at a wall.
     """
     assert case.ostium is not None
-    points_mm, area_mm2 = sampling.surface_samples(case.ostium, SAMPLE_CELLS * field.cell_size_mm)
-    points = (points_mm - field.origin_mm) / field.cell_size_mm
+    grid = sampling.uniform(field).finest
+    points_mm, area_mm2 = sampling.surface_samples(case.ostium, SAMPLE_CELLS * grid.cell_size_mm)
+    points = grid.places(points_mm)
     found = np.zeros(len(points))
     for axis, step in enumerate(np.eye(3, dtype=np.int64)):
         low = near.left[near.axis == axis]
         fine = (low < len(near.cells)) & (near.width[np.minimum(low, len(near.cells) - 1)] == 1)
-        per_mm2 = np.zeros(field.index.shape)
-        per_mm2[tuple(near.cells[low[fine]].T)] = through[near.axis == axis][fine] / field.cell_size_mm**2
+        per_mm2 = np.zeros(grid.index.shape)
+        per_mm2[tuple(near.cells[low[fine]].T)] = through[near.axis == axis][fine] / grid.cell_size_mm**2
         found += area_mm2[:, axis] * map_coordinates(per_mm2, (points - 0.5 * step).T, order=1)
     return found
 

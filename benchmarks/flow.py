@@ -162,7 +162,7 @@ def table(case: FlowCase, fields: dict[str, FlowField], clock_s: float, core_s: 
     print("|---|---|---|---|---|---|---|---|")
     for flow, field in fields.items():
         found = indices(field, case.sac, case.ostium)
-        row = (flow, len(field.cells), field.steps, field.is_converged, round(field.updates_per_s / 1e6))
+        row = (flow, len(field.centers_mm), field.steps, field.is_converged, round(field.updates_per_s / 1e6))
         values = f"{found['neck_inflow_mL_s']:.4f} | {1e3 * found['mean_sac_velocity_m_s']:.2f}"
         print(f"| {' | '.join(map(str, row))} | {values} | {found['mean_sac_wss_Pa']:.4f} |")
     peak_GB = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9

@@ -102,7 +102,7 @@ def computed(
 
 def alignment(screened: FlowField, resolved: FlowField, sac: Surface) -> float:
     """Correlation of two velocity fields in the sac, on the cells of the first."""
-    cells = sampling.cells_inside(sac, screened.centers_mm, screened.cell_size_mm)
+    cells = sampling.field_cells_inside(screened, sac)
     one = screened.velocity_m_s[cells]
     other = sampling.values_at(resolved, screened.centers_mm[cells])[0]
     return round(float((one * other).sum() / np.sqrt((one**2).sum() * (other**2).sum())), 4)

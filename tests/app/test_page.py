@@ -718,8 +718,8 @@ def keep_contrast(folder):
     """Keep contrast with every flow of a study, as an angiogram does."""
     for path in kept_flows(folder).values():
         carrier = load_data(path, FlowField)
-        stored = np.full((3, len(carrier.cells)), 200, np.uint8)
-        block = np.arange(len(carrier.cells))
+        stored = np.full((3, len(carrier.centers_mm)), 200, np.uint8)
+        block = np.arange(len(carrier.centers_mm))
         history = History(carrier.centers_mm, carrier.finest.cell_size_mm, block, np.arange(3) / 15, stored, 300.0)
         save_data(path.with_name(path.name.replace("flow ", "contrast ", 1)), history)
 

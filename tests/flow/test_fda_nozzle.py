@@ -215,7 +215,7 @@ def jet(experiments: list[dict[str, np.ndarray]]) -> FlowField:
 def test_the_axis_of_the_jet_is_inside_the_spread_of_the_experiments(
     jet: FlowField, experiments: list[dict[str, np.ndarray]]
 ) -> None:
-    print(f"\n{len(jet.cells)} cells, {jet.steps} steps, {jet.seconds:.0f} s: {jet.advice}")  # noqa: T201
+    print(f"\n{len(jet.centers_mm)} cells, {jet.steps} steps, {jet.seconds:.0f} s: {jet.advice}")  # noqa: T201
     print(f"flow of the five: {own_flow_mL_s(experiments):.2f} mL/s")  # noqa: T201
     found = {z_mm: outside(jet, experiments, z_mm) for z_mm in SECTIONS_MM}
     for z_mm, one in found.items():

@@ -91,6 +91,7 @@ def test_the_file_of_a_flow_covers_its_volume_once(tmp_path: Path) -> None:
     data = sizes.GetOutput()
     volume_mm3 = vtk_to_numpy(data.GetCellData().GetArray("Volume"))
     np.testing.assert_allclose(volume_mm3, field.sizes_mm**3)
+    assert volume_mm3.sum() == pytest.approx(4 * 8 * 8 + 4 * 7.5 * 8)
     np.testing.assert_array_equal(vtk_to_numpy(data.GetCellData().GetArray("velocity_m_s")), field.velocity_m_s)
     corners_mm = vtk_to_numpy(data.GetPoints().GetData())
     assert len(np.unique(corners_mm, axis=0)) == len(corners_mm)  # also where the grids meet

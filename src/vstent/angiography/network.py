@@ -194,10 +194,9 @@ def network(case: FlowCase, field: FlowField) -> Network:
     field = uniform(field)
     grid = field.finest
     surface, face_patch, _ = domains.extend(case.vessel)
-    neighbour = domains.neighbours(grid.index, grid.cells)
+    neighbour = grid.neighbours()
     is_open = neighbour >= 0
-    parted = domains.septa(surface, neighbour, grid.cells, grid.origin_mm, grid.cell_size_mm)
-    is_open[parted] = False
+    is_open[domains.septa(surface, neighbour, grid)] = False
     left, axis = np.nonzero(is_open[:, ALONG_AXES])
     right = neighbour[left, 2 * axis + 1]
     at_cell, at_axis, at_sign, opening = _mouths(case, grid, neighbour, surface, face_patch)

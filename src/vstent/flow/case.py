@@ -7,13 +7,13 @@ from functools import cached_property
 import numpy as np
 
 from vstent.devices.stent import Stent
+from vstent.flow.cells import Cells
 from vstent.flow.ends import End, FlowRate, Inflow
 from vstent.flow.settings import Blood, Numerics
 from vstent.flow.waveform import Waveform
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Vessel
-from vstent.kernels import voxels
-from vstent.kernels.arrays import Bools, Floats, Ints, freeze, read_only
+from vstent.kernels.arrays import Bools, Floats, freeze, read_only
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,15 +124,9 @@ PHASES = 20
 
 
 @dataclass(frozen=True, eq=False)
-class Level:
+class Level(Cells):
     """One grid of a flow: its blood cells and the flow in them."""
 
-    cells: Ints
-    """(n, 3) integer grid coordinates of the blood cells, sorted."""
-    origin_mm: Floats
-    """(3,) centre of the cell (0, 0, 0)."""
-    cell_size_mm: float
-    """Grid spacing."""
     velocity_m_s: Floats
     """(n, 3) velocity at the cell centres."""
     pressure_Pa: Floats
@@ -142,40 +136,21 @@ class Level:
     oscillations cancel; None for any other flow."""
 
     def __post_init__(self) -> None:
-        freeze(self, "cells", np.int32, (-1, 3))
-        n = len(self.cells)
-        freeze(self, "origin_mm", np.float64, (3,))
-        freeze(self, "velocity_m_s", np.float64, (n, 3))
-        freeze(self, "pressure_Pa", np.float64, (n,))
+        super().__post_init__()
+        freeze(self, "velocity_m_s", np.float64, (len(self.cells), 3))
+        freeze(self, "pressure_Pa", np.float64, (len(self.cells),))
         if self.mean_speed_m_s is not None:
-            freeze(self, "mean_speed_m_s", np.float64, (n,))
+            freeze(self, "mean_speed_m_s", np.float64, (len(self.cells),))
 
-    @cached_property
-    def centers_mm(self) -> Floats:
-        """Cell centres (n, 3)."""
-        return self.origin_mm + self.cells * self.cell_size_mm
-
-    @cached_property
-    def index(self) -> Ints:
-        """Index of the cell at every grid point (i, j, k), -1 outside the blood."""
-        return voxels.index_of(self.cells)
+    @staticmethod
+    def of(cells: Cells, velocity_m_s: Floats, pressure_Pa: Floats, mean_speed_m_s: Floats | None = None) -> "Level":
+        """Return the level of a flow in the cells of a grid."""
+        return Level(cells.cells, cells.origin_mm, cells.cell_size_mm, velocity_m_s, pressure_Pa, mean_speed_m_s)
 
     @cached_property
     def speed_m_s(self) -> Floats:
         """Magnitude (n,) of the velocity; its time average in an unsteady flow at constant inflow."""
         return np.linalg.norm(self.velocity_m_s, axis=1) if self.mean_speed_m_s is None else self.mean_speed_m_s
-
-    def places(self, points_mm: Floats) -> Floats:
-        """Return the grid coordinates (m, 3) of points (m, 3)."""
-        return (points_mm - self.origin_mm) / self.cell_size_mm
-
-    def cells_at(self, points_mm: Floats) -> Ints:
-        """Return the cell (m,) in which each point (m, 3) lies, -1 outside the blood."""
-        place = np.rint(self.places(points_mm)).astype(int)
-        is_near = ((place >= 0) & (place < self.index.shape)).all(axis=1)
-        found = np.full(len(points_mm), -1, dtype=np.int32)
-        found[is_near] = self.index[tuple(place[is_near].T)]
-        return found
 
 
 @dataclass(frozen=True, eq=False)

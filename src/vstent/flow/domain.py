@@ -10,6 +10,7 @@ from scipy import ndimage
 from vstent.errors import FlowError
 from vstent.flow import sampling
 from vstent.flow.case import FlowCase
+from vstent.flow.cells import Cells
 from vstent.flow.settings import Blood
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Opening, Vessel
@@ -43,15 +44,9 @@ class CoarseGridError(FlowError):
 
 
 @dataclass(frozen=True, eq=False)
-class Domain:
+class Domain(Cells):
     """Blood cells of a regular grid and the links that leave them."""
 
-    cell_size_mm: float
-    """Grid spacing."""
-    origin_mm: Floats
-    """(3,) centre of the cell (0, 0, 0)."""
-    cells: Ints
-    """(n, 3) integer coordinates, sorted; the outermost layer of the grid contains no blood."""
     link_cell: Ints
     """(l,) index of the cell that each link leaves."""
     link_direction: Ints
@@ -71,24 +66,13 @@ class Domain:
     """For every opening the polygon (k, 3) at the end of its extension, in mm."""
 
     def __post_init__(self) -> None:
-        freeze(self, "origin_mm", np.float64, (3,))
-        freeze(self, "cells", np.int32, (-1, 3))
+        super().__post_init__()
         freeze(self, "link_cell", np.int32, (-1,))
         freeze(self, "link_direction", np.int32, self.link_cell.shape)
         freeze(self, "link_fraction", np.float64, self.link_cell.shape)
         freeze(self, "link_patch", np.int32, self.link_cell.shape)
         freeze(self, "septum_cell", np.int32, (-1,))
         freeze(self, "septum_direction", np.int32, self.septum_cell.shape)
-
-    @cached_property
-    def centers_mm(self) -> Floats:
-        """Cell centres (n, 3)."""
-        return self.origin_mm + self.cells * self.cell_size_mm
-
-    @cached_property
-    def index(self) -> Ints:
-        """Index of the cell at every grid point (i, j, k), -1 outside the blood."""
-        return voxels.index_of(self.cells)
 
     @cached_property
     def depth_mm(self) -> Floats:
@@ -248,15 +232,14 @@ def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None) -> 
             f"{place(vessel.inlet.center_mm)}, so the grid is too coarse or the inlet is blocked: use a finer grid "
             "spacing, or check the inlet"
         )
-    index = np.full(inside.shape, -1, dtype=np.int32)
-    index[inside] = np.arange(len(cells), dtype=np.int32)
-    neighbour = neighbours(index, cells)
+    grid = Cells(cells, origin_mm, cell_size_mm)
+    neighbour = grid.neighbours()
     is_beyond = filled & ~inside & (window is not None)
-    links = _links(surface, face_patch, neighbour, cells, is_beyond, origin_mm, cell_size_mm)
+    links = _links(surface, face_patch, neighbour, grid, is_beyond)
     if window is None:
         _refuse_unreached_inlet(vessel, links[3], cell_size_mm)
-    parted = septa(surface, neighbour, cells, origin_mm, cell_size_mm)
-    return Domain(cell_size_mm, origin_mm, cells, *links, *parted, surface, sections)
+    parted = septa(surface, neighbour, grid)
+    return Domain(cells, origin_mm, cell_size_mm, *links, *parted, surface, sections)
 
 
 def _refuse_unreached_inlet(vessel: Vessel, link_patch: Ints, cell_size_mm: float) -> None:
@@ -398,42 +381,22 @@ def _strip(inner: Ints, outer: Ints) -> Ints:
 
 
 def _links(
-    surface: Surface,
-    face_patch: Ints,
-    neighbour: Ints,
-    cells: Ints,
-    is_beyond: Bools,
-    origin_mm: Floats,
-    cell_size_mm: float,
+    surface: Surface, face_patch: Ints, neighbour: Ints, grid: Cells, is_beyond: Bools
 ) -> tuple[Ints, Ints, Floats, Ints]:
     """Return the links that leave the blood: their cell, direction, fraction to the surface and patch."""
     cell, direction = np.nonzero(neighbour < 0)
-    starts = origin_mm + cells[cell] * cell_size_mm
-    step_mm = VELOCITIES[direction] * cell_size_mm
+    starts, step_mm = grid.centers_mm[cell], VELOCITIES[direction] * grid.cell_size_mm
     length_mm = np.linalg.norm(step_mm, axis=1)
     fraction = surface.first_hit(starts, step_mm / length_mm[:, None]) / length_mm
     is_missed = fraction > 1.0
     fraction = np.clip(np.where(is_missed, 0.5, fraction), 1e-3, 1.0)
     _, _, face = surface.closest(starts + fraction[:, None] * step_mm)
-    goes_on = is_beyond[tuple((cells[cell] + VELOCITIES[direction]).T)]
+    goes_on = is_beyond[tuple((grid.cells[cell] + VELOCITIES[direction]).T)]
     patch = np.where(is_missed, np.where(goes_on, BEYOND, WALL), face_patch[face])
     return cell.astype(np.int32), direction.astype(np.int32), fraction, patch.astype(np.int32)
 
 
-def neighbours(index: Ints, cells: Ints) -> Ints:
-    """Return the cell indices (n, 19) of every cell's neighbours, -1 where they are not blood.
-
-    Parameters
-    ----------
-    index : (i, j, k) int
-        Index of the cell at every grid point, -1 outside the blood.
-    cells : (n, 3) int
-        Grid coordinates of the cells.
-    """
-    return np.stack([index[tuple((cells + c).T)] for c in VELOCITIES], axis=1)
-
-
-def septa(surface: Surface, neighbour: Ints, cells: Ints, origin_mm: Floats, cell_size_mm: float) -> tuple[Ints, Ints]:
+def septa(surface: Surface, neighbour: Ints, grid: Cells) -> tuple[Ints, Ints]:
     """Find the links between two blood cells that a wall separates.
 
     Parameters
@@ -441,9 +404,9 @@ def septa(surface: Surface, neighbour: Ints, cells: Ints, origin_mm: Floats, cel
     surface : Surface
         Closed boundary of the blood.
     neighbour : (n, 19) int
-        Neighbour indices (see `neighbours`).
-    cells, origin_mm, cell_size_mm : array, array, float
-        As in a `Domain`.
+        Neighbours of the cells.
+    grid : Cells
+        The cells.
 
     Returns
     -------
@@ -454,10 +417,9 @@ def septa(surface: Surface, neighbour: Ints, cells: Ints, origin_mm: Floats, cel
     candidate = is_edge[:, None] & (neighbour >= 0) & is_edge[neighbour]
     candidate[:, 0::2] = False
     cell, direction = np.nonzero(candidate)
-    starts = origin_mm + cells[cell] * cell_size_mm
-    crosses = surface.crosses(starts, starts + VELOCITIES[direction] * cell_size_mm)
-    cell, direction, starts = cell[crosses], direction[crosses], starts[crosses]
-    step_mm = VELOCITIES[direction] * cell_size_mm
+    crosses = surface.crosses(grid.centers_mm[cell], grid.centers_mm[cell] + VELOCITIES[direction] * grid.cell_size_mm)
+    cell, direction = cell[crosses], direction[crosses]
+    starts, step_mm = grid.centers_mm[cell], VELOCITIES[direction] * grid.cell_size_mm
     along = step_mm / np.linalg.norm(step_mm, axis=1)[:, None]
     this_side, that_side = surface.first_hits(starts, along)[1], surface.first_hits(starts + step_mm, -along)[1]
     parts = np.einsum("ij,ij->i", surface.normals[this_side], surface.normals[that_side]) < BACK_TO_BACK

@@ -77,7 +77,7 @@ def _fit(domain: Domain, velocity_m_s: Floats, pressure_Pa: Floats, lumen: Surfa
         domain.depth_mm / domain.cell_size_mm,
         velocity_m_s,
         pressure_Pa,
-        (lumen.vertices_mm - domain.origin_mm) / domain.cell_size_mm,
+        domain.places(lumen.vertices_mm),
         -lumen.vertex_normals,
         REACH,
     )

@@ -267,7 +267,7 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     "inlet_pressure_Pa": Definition("Inlet pressure", "Mean pressure over the inlet, relative to the outlets."),
     "pressure_drop_Pa": Definition("Pressure drop", "Pressure at the inlet minus pressure at the widest outlet."),
     "grid_spacing_mm": Definition("Grid spacing", "Distance between neighboring cells of the flow's grid."),
-    "cells_count": Definition("Cells", "Number of cells of blood on the grid."),
+    "cells_count": Definition("Cells", "Number of cells of blood; coarse cells that contain finer ones do not count."),
     "steps_count": Definition("Time steps", "Number of time steps or iterations on the finest grid."),
     "inflow_mL_s": Definition("Inflow", "Mean flow rate through all inlets together."),
     "inlet_reynolds_number_count": Definition(

@@ -205,10 +205,10 @@ def _parts(graph: csr_matrix, is_beyond: Bools, ends: Ints) -> Ints:
 
 def _neighbours(grid: Level, surface: Surface) -> csr_matrix:
     """Return the distances, mm, between neighbouring cells that are not separated by the wall."""
-    neighbour = domains.neighbours(grid.index, grid.cells)
+    neighbour = grid.neighbours()
     is_open = neighbour >= 0
     is_open[:, 0::2] = False  # count every pair once
-    is_open[domains.septa(surface, neighbour, grid.cells, grid.origin_mm, grid.cell_size_mm)] = False
+    is_open[domains.septa(surface, neighbour, grid)] = False
     cell, direction = np.nonzero(is_open)
     length_mm = grid.cell_size_mm * np.linalg.norm(VELOCITIES, axis=1)[direction]
     places = cell, neighbour[cell, direction]

@@ -315,10 +315,10 @@ class LiveFlow:
     def field(self) -> FlowField:
         """Return the present flow in the refined region, for streamlines: only its velocity is meaningful."""
         now, domain, wall = snapshot(self.state), self.state.domain, self.case.vessel.lumen
-        n, outer, grid = len(wall.vertices_mm), self.outer, (domain.cells, domain.origin_mm, domain.cell_size_mm)
+        n, outer = len(wall.vertices_mm), self.outer
         return replace(
             outer,
-            levels=(Level(*grid, now.velocity_m_s.astype(np.float64), now.pressure_Pa.astype(np.float64)),),
+            levels=(Level.of(domain, now.velocity_m_s.astype(np.float64), now.pressure_Pa.astype(np.float64)),),
             wall_shear_stress_Pa=np.zeros((n, 3)),
             mean_shear_Pa=None,
         )

@@ -98,9 +98,8 @@ def field_of(
     domain, vessel = state.domain, state.case.vessel
     section_Pa = domains.section_pressure_Pa(vessel, domain, flow.pressure_Pa)
     inlet_Pa, outlet_Pa = vessel.of_inlets_and_outlets(section_Pa)
-    grid = domain.cells, domain.origin_mm, domain.cell_size_mm
     field = FlowField(
-        levels=(Level(*grid, flow.velocity_m_s, flow.pressure_Pa, flow.mean_speed_m_s),),
+        levels=(Level.of(domain, flow.velocity_m_s, flow.pressure_Pa, flow.mean_speed_m_s),),
         wall=vessel.lumen,
         wall_shear_stress_Pa=flow.wall_shear_stress_Pa,
         wall_pressure_Pa=flow.wall_pressure_Pa,

@@ -131,7 +131,7 @@ def _probe(case: FlowCase, domain: domains.Domain) -> Probe:
     if case.ostium is None:
         return Probe(cells, np.zeros((0, 3)), np.zeros((0, 3)))
     points_mm, area_mm2 = sampling.surface_samples(case.ostium, domain.cell_size_mm)
-    return Probe(cells, (points_mm - domain.origin_mm) / domain.cell_size_mm, area_mm2)
+    return Probe(cells, domain.places(points_mm), area_mm2)
 
 
 def _begin_from(state: State, start: FlowField) -> None:

@@ -226,11 +226,10 @@ def _field_of(state: State, kept: list[Snapshot], outcome: Outcome) -> FlowField
     pressure_Pa, outflow_mL_s = mean("pressure_Pa"), mean("outflow_mL_s")
     inlet_Pa, outlet_Pa = vessel.of_inlets_and_outlets(domains.section_pressure_Pa(vessel, domain, pressure_Pa))
     backwards_mL_s, outlets_mL_s = vessel.of_inlets_and_outlets(outflow_mL_s)
-    grid = domain.cells, domain.origin_mm, domain.cell_size_mm
     speed_m_s, shear_Pa = (None, None) if state.is_pulse or len(kept) == 1 else mean_magnitudes(kept)
     steps = len(state.history) * (1 if state.is_pulse else CHECK_ITERATIONS)
     return FlowField(
-        levels=(Level(*grid, mean("velocity_m_s"), pressure_Pa, speed_m_s),),
+        levels=(Level.of(domain, mean("velocity_m_s"), pressure_Pa, speed_m_s),),
         wall=vessel.lumen,
         wall_shear_stress_Pa=mean("wall_shear_stress_Pa"),
         wall_pressure_Pa=mean("wall_pressure_Pa"),
