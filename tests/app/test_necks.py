@@ -80,7 +80,7 @@ def test_a_neck_and_lengths_make_what_depends_on_them_stale_and_reach_the_study(
         if name == "uncertainty_samples":
             assert choices.settings(Settings()).uncertainty == Ranges(16)
         else:
-            assert getattr(choices.settings(Settings()), name) == value
+            assert getattr(choices.settings(Settings()).anatomy, name) == value
 
 
 def test_the_neck_is_told_over_http(anatomy, tmp_path, monkeypatch):
