@@ -13,6 +13,7 @@ import pytest
 from browsing import SECOND, at, browsing, drop, in_time, needs_browser, playwright, step
 
 from vstent import phantoms
+from vstent.cli import main
 from vstent.io.writers import write_stl
 from vstent.study.folder import CACHE
 
@@ -65,13 +66,41 @@ def test_from_a_dropped_surface_to_a_device_dragged(artery, tmp_path):
         assert in_time(page, lambda: abs(place_of(page, "distal") - before) > 0.5)
         after = place_of(page, "distal")
         view = client.get(f"/api/cases/{client.get('/api/cases').json()['cases'][0]['id']}").json()
-        assert view["choices"]["devices"][0]["center_mm"] is not None
+        assert view["choices"]["treatments"][0]["implants"][0]["placing"]["position_mm"] is not None
         # What was done is there after the page has been loaded anew.
         page.reload()
         page.wait_for_selector(".sheet .row")
         assert in_time(page, lambda: place_of(page, "distal") == pytest.approx(after, abs=0.11))
         undone(page)
         type_while_the_page_is_redrawn(client, page)
+
+
+def test_of_a_treatment_with_two_implants_both_are_shown_and_each_is_moved(artery, tmp_path):
+    study = tmp_path / "study"
+    command = ["run", str(artery), "--out", str(study), "--units", "mm", "--treatment", "silk + silk@-4", "--no-flow"]
+    assert main(command) == 0
+    with app_case.served(tmp_path / "cases", study) as client, browsing(client) as page:
+        step(page, "Device")
+        box = page.locator("label.device", has_text="1. Silk, 2. Silk")
+        playwright.expect(box.locator("input")).to_be_checked()
+        step(page, "Deploy")
+        playwright.expect(page.locator(".sheet.columns-2 .row.head b")).to_have_text(
+            ["1. Silk 4 × 15 mm", "2. Silk 4 × 15 mm"]
+        )
+        outer = place_of(page, "distal")
+        page.get_by_role("button", name="2. Silk").click()
+        assert in_time(page, lambda: place_of(page, "distal") < outer - 1.0)
+        before = place_of(page, "distal")
+        drag(page, ".handle.distal .knob", 40, 0)
+        page.wait_for_function("() => !document.querySelector('button[aria-label=Undo]').disabled")
+        assert in_time(page, lambda: place_of(page, "distal") > before + 0.5)
+        (treatment,) = client.get("/api/cases/study").json()["choices"]["treatments"]
+        moved = [implant["placing"]["position_mm"] is not None for implant in treatment["implants"]]
+        assert moved == [False, True]
+        page.get_by_role("button", name="1. Silk").click()
+        assert in_time(page, lambda: place_of(page, "distal") == outer)
+        playwright.expect(page.locator(".section-words")).to_contain_text("Free device")
+        assert page.locator(".section .cut.device").count() == 2
 
 
 RAMPS = """() => [...document.querySelectorAll('.viewer-bar')].map((bar) => {
@@ -320,7 +349,7 @@ def whole_way(client, page, path):
     assert len(client.get(f"{files}/report.html").content) < 10_000_000
     assert client.get(f"{files}/report.pdf").content.startswith(b"%PDF")
     metrics = json.loads(client.get(f"{files}/metrics.json").text)
-    assert metrics["stents"]["enterprise"]["flow"]["neck_inflow_mL_s"] > 0
+    assert metrics["treatments"]["enterprise"]["flow"]["neck_inflow_mL_s"] > 0
 
 
 def look_at_the_angiogram(page):
@@ -398,7 +427,8 @@ def test_a_flow_goes_on_where_it_was_when_the_server_was_killed(artery, tmp_path
         step(page, "Report")
         page.wait_for_selector(".card")
     assert bare.stat().st_mtime_ns == computed
-    assert json.loads((tmp_path / case / "metrics.json").read_text())["stents"]["silk"]["flow"]["neck_inflow_mL_s"] > 0
+    metrics = json.loads((tmp_path / case / "metrics.json").read_text())
+    assert metrics["treatments"]["silk"]["flow"]["neck_inflow_mL_s"] > 0
 
 
 @pytest.mark.validation

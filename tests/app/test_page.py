@@ -23,11 +23,11 @@ from vstent.app.cases import STEPS, Store, load
 from vstent.app.desk import Desk
 from vstent.app.finished import kept_flows
 from vstent.cli import main
-from vstent.deployment.deploy import deploy
+from vstent.deployment.deploy import deploy, propose_landing
 from vstent.deployment.measure import measure
 from vstent.devices.catalogue import find_design
 from vstent.devices.stent import Landing
-from vstent.devices.treatment import with_device
+from vstent.devices.treatment import read_treatment, with_device
 from vstent.errors import ReadError
 from vstent.flow.case import FlowField, Phase
 from vstent.flow.settings import Blood, CarreauYasuda, FlowSettings, Numerics, Waveform
@@ -51,11 +51,19 @@ def alone(device, **given):
 
 
 def wanted(treatment, **given):
-    """What is asked of a treatment of one device."""
-    return {"treatment": treatment, "implant": treatment["name"]} | given
+    """What is asked of the first implant of a treatment."""
+    return {"treatment": treatment, "implant": treatment["implants"][0]["id"]} | given
 
 
 SILK = alone("silk")
+TWO = {
+    "name": "two",
+    "implants": [
+        {"id": "outer", "device": "silk"},
+        {"id": "inner", "device": "silk", "placing": {"shift_mm": -4.0}, "inside": ["outer"]},
+    ],
+}
+"""A treatment of two implants, the second inside the first and further upstream."""
 
 
 @pytest.fixture(scope="module")
@@ -346,6 +354,63 @@ def test_sizes_side_by_side_are_the_deployments_on_one_scale(client, case):
     assert client.post(f"{case}/comparison", json={"treatments": 5 * [SILK]}).status_code == 422
 
 
+def wires_of(said, raw, pane):
+    """Points of the wires in a pane of a message, one array per implant."""
+    layers = [layer for layer in said["layers"] if (layer["id"], layer["pane"]) == ("wires", pane)]
+    return [app_case.numbers(layer["points"], raw) for layer in layers]
+
+
+def test_of_two_implants_the_inner_opens_in_the_outer_and_is_deployed_again_where_that_moves(client, case, workspace):
+    anatomy, silk = anatomy_of(client, case, workspace), find_design("silk")
+    outer = deploy(silk, anatomy)
+    place = propose_landing(silk, anatomy, outer.stent.size)
+    inner_at = replace(place, abscissa_mm=place.abscissa_mm - 4.0)
+    inner = deploy(silk, anatomy, landing=inner_at, inside=[outer.stent])
+    told, raw = app_case.opened(client.post(f"{case}/deployment", json=wanted(TWO, implant="inner")))
+    assert (told["treatment"], told["implant"]) == ("two", "inner")
+    assert told["title"] == "Silk 4 × 15 mm + Silk 4 × 15 mm"
+    assert told["length_mm"] == pytest.approx(inner.stent.deployed_length_mm, rel=1e-9)
+    assert [sheet["title"] for sheet in told["measures"]] == ["1. Silk 4 × 15 mm", "2. Silk 4 × 15 mm"]
+    for found, one in zip(wires_of(told, raw, "two"), (outer, inner), strict=True):
+        np.testing.assert_allclose(found, one.stent.wire_points_mm, atol=2e-3)
+    # While the outer one is dragged, the inner one stays as it was deployed.
+    there_mm = told["ends_mm"][0] - 2.0
+    dragged = wanted(TWO, implant="outer", anchor="proximal", abscissa_mm=there_mm)
+    sketched, raw = app_case.opened(client.post(f"{case}/sketch", json=dragged))
+    assert sketched["ends_mm"][0] == pytest.approx(there_mm, abs=1e-3)
+    assert np.abs(wires_of(sketched, raw, "two")[1] - inner.stent.wire_points_mm).max() < 2e-3
+    # Let go, it opens in the outer one at its new place.
+    moved = deploy(silk, anatomy, landing=Landing(sketched["center_mm"]))
+    again = deploy(silk, anatomy, landing=inner_at, inside=[moved.stent])
+    placed = {"placing": {"position_mm": sketched["center_mm"]}}
+    both = TWO | {"implants": [TWO["implants"][0] | placed, TWO["implants"][1]]}
+    told, raw = app_case.opened(client.post(f"{case}/deployment", json=wanted(both, implant="outer")))
+    np.testing.assert_allclose(wires_of(told, raw, "two")[1], again.stent.wire_points_mm, atol=2e-3)
+    assert np.abs(again.stent.wire_points_mm - inner.stent.wire_points_mm).max() > 0.02
+    refused = client.post(f"{case}/deployment", json=wanted(TWO, implant="third"))
+    assert (refused.status_code, "not among the implants" in refused.json()["detail"]) == (422, True)
+
+
+def test_a_section_through_two_implants_has_both_and_the_diameters_of_one(client, case):
+    choose(client, case, treatments=[TWO])
+    told, _ = app_case.opened(client.post(f"{case}/deployment", json=wanted(TWO, implant="inner")))
+    both_mm = told["ends_mm"][1] - 1.0  # the outer one reaches further
+    widths = []
+    for implant in ("outer", "inner"):
+        query = {"abscissa_mm": both_mm, "treatment": "two", "implant": implant}
+        section = client.get(f"{case}/section", params=query).json()
+        assert len(section["rings"]) == 2
+        widths.append(section["device_diameter_mm"])
+    assert widths[1] < widths[0] - 0.1  # by two wires
+    query = {"abscissa_mm": told["ends_mm"][0] + 1.0, "treatment": "two", "implant": "outer"}
+    section = client.get(f"{case}/section", params=query).json()
+    assert (len(section["rings"]), "device_diameter_mm" in section) == (1, False)
+    sheet = client.post(f"{case}/bands", json=wanted(TWO, implant="inner")).json()
+    assert (sheet["treatment"], sheet["implant"]) == ("two", "inner")
+    assert client.get(f"{case}/plan.pdf").content.count(b"/MediaBox") == 2
+    choose(client, case, treatments=[SILK])
+
+
 def test_flows_of_the_best_sizes_join_a_ranking_that_is_there_before(artery, tmp_path, monkeypatch):
     """The flows are those of `rank_flows`, given the number that was chosen and a store in the case folder."""
     asked = {}
@@ -483,6 +548,42 @@ def flown(study, tmp_path):
     for name in ("bare", "silk"):
         keep_flow(folder, told["input"]["sha256"], settings_of(told["settings"]), name)
     return folder, told
+
+
+def test_a_study_of_two_implants_opens_with_its_flow_and_numbers(flown, tmp_path):
+    folder, told = flown
+    told["settings"]["treatments"] = [asdict(read_treatment("silk + silk@-4"))]
+    (folder / "run.json").write_text(json.dumps(told))
+    metrics = report_case.metrics()
+    silk = metrics["treatments"].pop("silk")
+    del metrics["treatments"]["enterprise"]
+    measures = [{"device": "Silk", "size": f"4.00 x {length} mm"} for length in (15, 20)]
+    silk["implants"] = dict(zip(("silk", "silk_2"), measures, strict=True))
+    metrics["treatments"]["silk+silk_2"] = silk
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    for name in ("bare", "silk+silk_2"):
+        keep_flow(folder, told["input"]["sha256"], settings_of(told["settings"]), name)
+    with app_case.served(tmp_path / "cases", folder) as client:
+        case = f"/api/cases/{client.get('/api/cases').json()['opened']}"
+        view = client.get(case).json()
+        assert set(view["steps"].values()) == {"done"}
+        (treatment,) = view["choices"]["treatments"]
+        assert [implant["inside"] for implant in treatment["implants"]] == [[], ["silk"]]
+        assert treatment["implants"][1]["placing"]["shift_mm"] == -4.0
+        assert app_case.opened(client.get(f"{case}/flow"))[0]["panes"] == ["bare", "silk+silk_2"]
+        (flow,) = client.get(f"{case}/numbers").json()["flow"]
+        assert (flow["names"], flow["devices"]) == (["silk+silk_2"], ["Silk 4.00 x 15 mm + Silk 4.00 x 20 mm"])
+
+
+def test_a_case_of_another_version_is_refused_in_a_sentence_and_left_as_it_is(tmp_path):
+    state = tmp_path / "old" / "app.json"
+    state.parent.mkdir()
+    state.write_text('{"name": "old", "choices": {"devices": [{"name": "silk"}]}}')
+    before = state.read_bytes()
+    with pytest.raises(ReadError, match=r"from another version of vstent: open the scan of the case again\.$"):
+        Desk(Store(tmp_path / "cases")).open(tmp_path / "old")
+    assert state.read_bytes() == before
+    assert [path.name for path in state.parent.iterdir()] == ["app.json"]
 
 
 def test_flows_of_other_settings_are_not_taken_for_those_of_the_results(flown, tmp_path):

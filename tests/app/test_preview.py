@@ -69,7 +69,7 @@ def test_without_a_device_nothing_changes(preview: Preview) -> None:
 
 
 def test_a_device_lowers_the_inflow_and_old_values_are_marked(preview: Preview, anatomy: Anatomy) -> None:
-    preview.place(vstent.deploy(vstent.find_design("silk"), anatomy).stent)
+    preview.place((vstent.deploy(vstent.find_design("silk"), anatomy).stent,))
     assert manifest(preview)["is_stale"]
     told = until(preview, lambda told: not told["is_stale"] and told["is_settled"])
     assert told["reductions"]["neck_inflow_mL_s"] < -15.0
@@ -83,7 +83,7 @@ def test_whoever_draws_a_device_does_not_wait_for_the_flow(preview: Preview, ana
     try:
         began = time.monotonic()
         for _ in range(20):
-            preview.place(stent)
+            preview.place((stent,))
             assert manifest(preview)["is_stale"]
         assert time.monotonic() - began < 1.0
     finally:
@@ -94,7 +94,7 @@ def test_whoever_draws_a_device_does_not_wait_for_the_flow(preview: Preview, ana
 
 
 def test_streamlines_that_the_page_has_are_not_sent_again(preview: Preview) -> None:
-    preview.place(preview._stent)
+    preview.place(preview._stents)
     os.kill(preview._process.pid, signal.SIGSTOP)
     try:
         told = manifest(preview)
@@ -159,7 +159,7 @@ def test_what_is_prepared_is_stored_and_continued(anatomy: Anatomy, tmp_path: Pa
             assert preview._said.values == {}
             (kept,) = tmp_path.glob("live-*.npz")
             assert (kept.stat().st_mtime_ns == written) is (damage is None and written > 0)
-            preview.place(stent)
+            preview.place((stent,))
             assert preview._sent == 0  # a device that nobody watches costs nothing
             told = until(preview, lambda told: not told["is_stale"] and "neck_inflow_mL_s" in told["error_points"])
             assert told["reductions"]["neck_inflow_mL_s"] < -15.0
@@ -192,7 +192,7 @@ class Idle:
     def __init__(self, anatomy: Anatomy, settings: FlowSettings, shelf: Shelf) -> None:
         self.shelf, self.is_watched, self.is_preparing, self.is_stopped = shelf, False, True, False
 
-    def place(self, stent: Stent) -> None:
+    def place(self, stents: tuple[Stent, ...]) -> None:
         """Do nothing."""
 
     def stop(self) -> None:

@@ -127,4 +127,4 @@ def test_a_contour_that_lies_on_the_wall_from_the_first_is_shown_too():
     energy, gap = deployment.energy_mm2[:3], np.zeros_like(deployment.wall_gap_mm)
     still = replace(deployment, history_mm=still, energy_mm2=energy, wall_gap_mm=gap)
     scene = scene_of(case.anatomy, {"silk": {"silk": still}}, case.fields)
-    assert _expansion("silk", 0, still, case.anatomy, scene).drawn().image.std() > 1
+    assert _expansion("silk", 0, {"silk": still}, case.anatomy, scene).drawn().image.std() > 1

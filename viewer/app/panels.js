@@ -347,10 +347,11 @@ const sizeWords = ({ diameter_mm, length_mm }) => (diameter_mm ? `${diameter_mm}
 
 /** A treatment of several devices, or one with a name of its own, as the study that the case was opened from had it. */
 function treatmentBox(page, treatment) {
+  const isProposed = treatment.implants.every(({ diameter_mm }) => !diameter_mm);
   return make("label", { className: "device", title: `Treatment ${treatment.name}` }, [
     treatmentTick(page, treatment.name, treatment, true),
     make("span", {}, [make("b", {}, [page.names.treatment(treatment.name)]), make("small", {}, [treatment.implants.map(({ id }) => page.names.implant(treatment.name, id)).join(", ")])]),
-    make("em", {}, [treatment.implants.map(sizeWords).join(" + ")]),
+    make("em", {}, isProposed ? [make("small", {}, ["proposed"])] : [treatment.implants.map(sizeWords).join(" + ")]),
   ]);
 }
 

@@ -48,8 +48,8 @@ from vstent.reporting.scene import (
     View,
     anatomy_layers,
     device_layers,
-    device_title,
     flow_layers,
+    implant_titles,
     node_coverage,
     scales_of,
     treatment_title,
@@ -213,15 +213,9 @@ class Live:
         return [*self._wires(pane, treatment, colour), *contours]
 
     def _sheets(self, treatment: Treatment) -> list[dict[str, Any]]:
-        """Return the tables of the deployed implants of a treatment; those of several are numbered in their order."""
-        several = len(treatment.implants) > 1
-        return [
-            sheets.device(
-                (f"{number}. " if several else "") + device_title(self.deployment(treatment, implant)),
-                self.measures(treatment, implant),
-            )
-            for number, implant in enumerate(treatment.implants, start=1)
-        ]
+        """Return the tables of the deployed implants of a treatment."""
+        titles = implant_titles(self.deployed(treatment))
+        return [sheets.device(titles[one.id], self.measures(treatment, one)) for one in treatment.implants]
 
     def bands_sheet(self, treatment: Treatment, implant: str) -> dict[str, Any]:
         """Return the bands of a deployed implant as the page shows them."""

@@ -5,7 +5,7 @@ maximum inscribed spheres along its axis, the initial contour with its triangles
 and the wires in the parent artery and in the patient's own artery.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -20,7 +20,17 @@ from vstent.kernels.arrays import Floats, Ints
 from vstent.reporting.figures import Plate, Shot
 from vstent.reporting.freestanding import freestanding_plate
 from vstent.reporting.node_rule import NodeRule
-from vstent.reporting.scene import Implants, LineLayer, MeshLayer, Scene, curves_layer, device_title, round_up, view_of
+from vstent.reporting.scene import (
+    Implants,
+    LineLayer,
+    MeshLayer,
+    Scene,
+    curves_layer,
+    device_title,
+    implant_titles,
+    round_up,
+    view_of,
+)
 from vstent.reporting.thinning import some_frames, thin_frames, thin_surface
 from vstent.units import counted
 
@@ -57,13 +67,17 @@ def method_plates(
     if whole is not None and _is_trimmed(whole, anatomy):
         found.append(_trimming(whole, scene))
     found += [_restoration(scene), _spheres(anatomy, scene)]
-    deployments = [one for deployed in implants.values() for one in deployed.values()]
-    if deployments:
-        stents = {device_title(one): one.stent for one in deployments}
+    titled = [
+        (title, deployed[key])
+        for name, deployed in implants.items()
+        for key, title in implant_titles(deployed, f"{name}: ").items()
+    ]
+    if titled:
+        stents = {device_title(one): one.stent for _, one in titled}
         found = [freestanding_plate(stents, scene, anatomy), *found]
-        found += [_first_contours(deployments, scene), _triangles(anatomy, deployments, scene), NodeRule()]
+        found += [_first_contours(titled, scene), _triangles(anatomy, titled, scene), NodeRule()]
         for name, deployed in implants.items():
-            found += [_expansion(name, number, one, anatomy, scene) for number, one in enumerate(deployed.values())]
+            found += [_expansion(name, number, deployed, anatomy, scene) for number in range(len(deployed))]
         found.append(_fitted(scene))
     return found
 
@@ -148,12 +162,12 @@ def _unit_sphere(rows: int = 17, columns: int = 32) -> tuple[Floats, Ints]:
     return points.reshape(-1, 3), tube_faces(rows, columns)[:, ::-1]
 
 
-def _first_contours(deployments: Sequence[Deployment], scene: Scene) -> Plate:
+def _first_contours(titled: Sequence[tuple[str, Deployment]], scene: Scene) -> Plate:
     """Return the picture of the contour of each device before the first iteration."""
     shots = []
-    for deployment in deployments:
+    for title, deployment in titled:
         layers = (*scene.pick(("axis",), BARE), *_contour_layers(deployment.history_mm[0]))
-        shots.append(Shot(device_title(deployment), (*_glass(scene), *layers), scene.view("profile")))
+        shots.append(Shot(title, (*_glass(scene), *layers), scene.view("profile")))
     caption = (
         "The contour before the first iteration, in the parent artery (glass): rows of nodes on planes across "
         "the axis, each as wide as the maximum inscribed sphere. Some rows are drawn as lines."
@@ -161,17 +175,17 @@ def _first_contours(deployments: Sequence[Deployment], scene: Scene) -> Plate:
     return Plate("first", "The initial contour", caption, scene, shots)
 
 
-def _triangles(anatomy: Anatomy, deployments: Sequence[Deployment], scene: Scene) -> Plate:
+def _triangles(anatomy: Anatomy, titled: Sequence[tuple[str, Deployment]], scene: Scene) -> Plate:
     """Return the picture of the triangle mesh of each contour near the neck, before and after the expansion."""
     profile, shots = scene.view("profile"), []
     middle_mm = _middle_mm(anatomy)
-    for deployment in deployments:
+    for title, deployment in titled:
         history_mm = deployment.history_mm
         for words, nodes_mm in (("initial", history_mm[0]), ("deployed", history_mm[-1])):
             near = np.linalg.norm(nodes_mm.mean(axis=1) - middle_mm, axis=1) < MESH_MM
             rows = nodes_mm[near] if near.sum() > 2 else nodes_mm
             view = view_of("mesh", profile.axes, rows.reshape(-1, 3))
-            shots.append(Shot(f"{device_title(deployment)}: {words}", (*_glass(scene), *mesh_layers(rows)), view))
+            shots.append(Shot(f"{title}: {words}", (*_glass(scene), *mesh_layers(rows)), view))
     caption = (
         f"The triangles of the contour within {MESH_MM:g} mm of the neck, before the first iteration and deployed, in "
         "the parent artery (glass; Zhong et al. 2016, fig. 6). Nodes are the corners of the triangles."
@@ -208,8 +222,9 @@ def _contour_layers(nodes_mm: Floats) -> tuple[MeshLayer | LineLayer, ...]:
     return MeshLayer("first", "", _STEEL, "", np.zeros(0), surface), curves_layer("rings", rings, 0.02, _INK)
 
 
-def _expansion(name: str, number: int, deployment: Deployment, anatomy: Anatomy, scene: Scene) -> Plate:
+def _expansion(name: str, number: int, deployed: Mapping[str, Deployment], anatomy: Anatomy, scene: Scene) -> Plate:
     """Return the picture of the expansion of one implant of a treatment, colored by the gap to the wall."""
+    key, deployment = list(deployed.items())[number]
     frames_mm, gaps_mm = thin_frames(deployment, anatomy.parent.landing_surface, FRAMES)
     contour = [layer for layer in scene.pick(("contour",), name) if isinstance(layer, MeshLayer)][number]
     reached = np.concatenate([[0.0], deployment.terminated_fraction])
@@ -227,7 +242,7 @@ def _expansion(name: str, number: int, deployment: Deployment, anatomy: Anatomy,
     gap = scene.scale("wall_gap")
     wide = replace(gap, high=round_up(max(gap.high, float(np.percentile(gaps_mm[0], 98)))))
     shown = replace(scene, scales=tuple(wide if scale is gap else scale for scale in scene.scales))
-    title = f"Expansion of {device_title(deployment)}"
+    title = f"Expansion of {implant_titles(deployed, f'{name}: ')[key]}"
     caption = (
         "Expansion of the active contour to the wall of the parent artery (glass) in "
         f"{counted(len(deployment.history_mm) - 1, 'iteration')}, colored by the remaining gap."

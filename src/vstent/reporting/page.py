@@ -30,7 +30,7 @@ from vstent.reporting.quantities import (
     opening_rows,
     unit_of,
 )
-from vstent.reporting.scene import Scene, device_title
+from vstent.reporting.scene import Scene, implant_titles
 from vstent.reporting.uncertainty import Varied, uncertainty_of
 
 if TYPE_CHECKING:
@@ -152,11 +152,9 @@ def contents_of(case: "CaseResult", drawing: Drawing | None = None) -> Contents:
         pictures=pictures,
         changes=compare(metrics, unusable(metrics)),
         implants=[
-            _implant(
-                deployment, metrics.get("treatments", {}).get(name, {}).get("implants", {}).get(key, {}), (name, key)
-            )
+            _implant(title, deployed[key], metrics["treatments"][name]["implants"][key], (name, key))
             for name, deployed in case.implants.items()
-            for key, deployment in deployed.items()
+            for key, title in implant_titles(deployed, f"{name}: ").items()
         ],
         openings=opening_rows(case.anatomy.vessel.openings),
         is_pulse=any(field.phases for field in case.fields.values()),
@@ -269,7 +267,7 @@ def _pane_notes(headlines: list[Change]) -> dict[str, str]:
     return {}
 
 
-def _implant(deployment: Deployment, measured: dict[str, Any], path: tuple[str, str]) -> dict[str, Any]:
+def _implant(title: str, deployment: Deployment, measured: dict[str, Any], path: tuple[str, str]) -> dict[str, Any]:
     """Return title, words, advice, quantities and facts of one implant."""
     stent = deployment.stent
     values = flatten({key: value for key, value in measured.items() if key != "bands"}, path)
@@ -279,7 +277,7 @@ def _implant(deployment: Deployment, measured: dict[str, Any], path: tuple[str, 
     count = len(deployment.terminated_fraction)
     steps = f"{count} iteration{'s' if count > 1 else ''}"
     return {
-        "title": device_title(deployment),
+        "title": title,
         "words": f"{wires}. The contour {how} after {steps}, in {deployment.seconds:.2f} s.",
         "advice": deployment.advice,
         "quantities": values,

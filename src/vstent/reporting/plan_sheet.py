@@ -17,7 +17,7 @@ from vstent.reporting.bands import ends, how_sure
 from vstent.reporting.figures import Picture, Plate, Shot
 from vstent.reporting.paper import QUIET, Paper
 from vstent.reporting.quantities import format_value
-from vstent.reporting.scene import Implants, device_title, scene_of
+from vstent.reporting.scene import Implants, implant_titles, scene_of
 
 PICTURE_SHARE: Final = 0.19
 """Largest height of the picture as a fraction of the page."""
@@ -54,6 +54,8 @@ class _Page(NamedTuple):
     case: Planned
     name: str
     """Name of its treatment."""
+    title: str
+    """Title of the implant."""
     deployment: Deployment
     metrics: Mapping[str, Any]
     picture: Picture
@@ -72,9 +74,17 @@ def plan_pdf(case: Planned) -> bytes:
 
     with rc_context({"pdf.fonttype": 42, "font.family": "DejaVu Sans"}):
         pages = [
-            _Page(case, name, one, case.metrics[name][key], _picture(case, name), _alternative_rows(case, one.stent))
+            _Page(
+                case,
+                name,
+                title,
+                deployed[key],
+                case.metrics[name][key],
+                _picture(case, name),
+                _alternative_rows(case, deployed[key].stent),
+            )
             for name, deployed in case.implants.items()
-            for key, one in deployed.items()
+            for key, title in implant_titles(deployed, f"{name}: ").items()
         ]
         scales = [next((scale for scale in SCALES if _fits(page, scale)), SCALES[-1]) for page in pages]
         paper = Paper(case.name, "plan", scale=scales[0])
@@ -95,7 +105,7 @@ def _fits(page: _Page, scale: float) -> bool:
 def _write(paper: Paper, page: _Page) -> None:
     """Write the page of one implant."""
     case, deployment, metrics = page.case, page.deployment, page.metrics
-    paper.title(f"{case.name}: {device_title(deployment)}")
+    paper.title(f"{case.name}: {page.title}")
     paper.text(
         f"Plan of {case.day}. Input SHA-256 {case.source[:HASH_DIGITS]}… Deployed length and fit are predictions."
     )

@@ -182,6 +182,19 @@ def device_title(deployment: Deployment) -> str:
     return f"{deployment.stent.design.name} {size.diameter_mm:g} × {size.length_mm:g} mm"
 
 
+def implant_titles(deployed: Mapping[str, Deployment], before: str = "") -> dict[str, str]:
+    """Return the titles of the implants of a treatment by id.
+
+    Parameters
+    ----------
+    deployed : deployed implants by id.
+    before : text before the titles of several implants; these are numbered in the order of deployment.
+    """
+    if len(deployed) == 1:
+        return {key: device_title(one) for key, one in deployed.items()}
+    return {key: f"{before}{n}. {device_title(one)}" for n, (key, one) in enumerate(deployed.items(), start=1)}
+
+
 def treatment_title(deployed: Mapping[str, Deployment]) -> str:
     """Return the devices of a treatment with their sizes: ``Silk 4.0 × 20 mm + Silk 3.5 × 15 mm``."""
     return " + ".join(map(device_title, deployed.values()))
