@@ -1,11 +1,14 @@
 """Print how exact and how fast the vessel is: segmentation, centerlines, parent artery.
 
 Run from the repository: ``python benchmarks/vessel.py``. The real cases are left out where they are not at hand.
+``python benchmarks/vessel.py aneurisk FOLDER`` finds the sac and the neck of every patient of a folder with
+``published.csv``, ``CASE.vtp`` and ``CASE_neck.vtp``, and compares them with the published ones.
 """
 
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +27,7 @@ from vstent.io.surfaces import read_surface
 from vstent.phantoms import Scanner
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "helpers"))
+from published_necks import Compared, compared, patients
 from sac_truth import (
     GLUED,
     anatomy_of,
@@ -157,7 +161,81 @@ def _stages(surface: Surface) -> list[np.ndarray]:
     return [repair_s, trace_s, trim_s, restore_s]
 
 
+N_PROCESSES = 2
+"""Processes in which patients are compared."""
+SMALL_MM3, SMALL_OFF_MM3 = 15.0, 3.0
+"""The volume of a sac smaller than the first may be off by the second."""
+
+
+def aneurisk(folder: Path) -> None:
+    """Sac and neck of every patient of a folder, found without any help, against the published ones."""
+    with ProcessPoolExecutor(N_PROCESSES) as pool:
+        rows = list(pool.map(compared, patients(folder)))
+    print(
+        "\n| patient | | volume, as closed | volume, plane | neck, plane | neck curve, projected | neck surface "
+        "| angle, degrees | curve's | middle, neck diameters | curve's | overlap, as closed | plane | own measuring "
+        "| CPU, s |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|"
+    )
+    for row in rows:
+        values = [*row.volumes, *row.areas, *np.degrees(row.angle_rad), *row.away, *row.overlap]
+        digits = [2] * 5 + [0] * 2 + [2] * 4
+        cells = " | ".join(f"{value:.{n}f}" for value, n in zip(values, digits, strict=True))
+        own = row.measured_mm3 / row.published[0]
+        print(f"| {row.case} | {row.kind} | {row.said or cells} | {own:.3f} | {row.seconds:.1f} |")
+    for kind, name in (("LAT", "sidewall"), ("TER", "at forks")):
+        some = [row for row in rows if row.kind == kind and not row.said]
+        if some:
+            _distribution(f"{name} ({len(some)} of {sum(row.kind == kind for row in rows)})", some)
+    _goals(rows)
+
+
+def _distribution(title: str, rows: list[Compared]) -> None:
+    """Print the 10 % quantile, the median, the 90 % quantile, bias and spread of every ratio."""
+    print(f"\n| {title} | 10 % | median | 90 % | bias | spread (standard deviation) |\n|---|---|---|---|---|---|")
+    for name, values in {
+        "sac volume, as closed / published": [row.volumes[0] for row in rows],
+        "sac volume, by plane / published": [row.volumes[1] for row in rows],
+        "neck by plane / published": [row.areas[0] for row in rows],
+        "neck curve, projected / published": [row.areas[1] for row in rows],
+        "neck surface / published": [row.areas[2] for row in rows],
+        "angle of the plane, degrees": np.degrees([row.angle_rad[0] for row in rows]),
+        "angle of the neck curve, degrees": np.degrees([row.angle_rad[1] for row in rows]),
+        "distance of the middles, plane, neck diameters": [row.away[0] for row in rows],
+        "distance of the middles, neck curve, neck diameters": [row.away[1] for row in rows],
+        "overlap of the sacs, as closed": [row.overlap[0] for row in rows],
+        "overlap of the sacs, by plane": [row.overlap[1] for row in rows],
+    }.items():
+        low, median, high = np.quantile(values, [0.1, 0.5, 0.9])
+        bias = np.mean(values) - (1.0 if "/" in name or "overlap" in name else 0.0)
+        print(f"| {name} | {low:.2f} | {median:.2f} | {high:.2f} | {bias:+.2f} | {np.std(values):.2f} |")
+
+
+def _goals(rows: list[Compared]) -> None:
+    """Print how many patients are within each tolerance."""
+    found = [row for row in rows if not row.said]
+    off = np.array([abs(row.volumes[1] - 1) for row in found])
+    small = np.array([row.published[0] < SMALL_MM3 for row in found])
+    small &= off * [row.published[0] for row in found] < SMALL_OFF_MM3
+    angle = np.degrees([row.angle_rad[0] for row in found])
+    print(f"\n| of {len(rows)} patients | |\n|---|---|")
+    for name, value in {
+        "a sac": len(found),
+        "overlap (intersection over union) at least 0.7": sum(row.overlap[0] >= 0.7 for row in found),
+        "middle of the neck within half the published diameter": sum(max(row.away) < 0.5 for row in found),
+        "volume by plane within 10 % (small sacs: 3 mm3)": ((off < 0.1) | small).sum(),
+        "volume by plane within 20 % (small sacs: 3 mm3)": ((off < 0.2) | small).sum(),
+        "neck by plane within 20 %": sum(abs(row.areas[0] - 1) < 0.2 for row in found),
+        "angle below 30 degrees": (angle < 30).sum(),
+        "median angle, degrees": f"{np.median(angle):.0f}",
+        "own measuring within 5 %": sum(abs(row.measured_mm3 / row.published[0] - 1) < 0.05 for row in rows),
+    }.items():
+        print(f"| {name} | {value} |")
+
+
 if __name__ == "__main__":
+    if sys.argv[1:2] == ["aneurisk"]:
+        aneurisk(Path(sys.argv[2]))
+        sys.exit()
     parts = sys.argv[1:] or ["centerlines", "walls", "sacs", "restored", "references", "speed"]
     for part in parts:
         if part not in ("restored", "references") or DATA.is_dir():

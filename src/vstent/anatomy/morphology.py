@@ -8,7 +8,7 @@ from scipy.spatial.distance import pdist
 
 from vstent.anatomy.landing_zones import landing_diameters_mm, neck_span_mm
 from vstent.anatomy.shape import beyond_plane, shape_indices
-from vstent.geometry.vessel import Anatomy, Aneurysm, Centerline
+from vstent.geometry.vessel import Anatomy, Aneurysm, Centerline, NeckPlane
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Floats
 
@@ -30,14 +30,16 @@ BENT: Final = 0.1
 def morphology(anatomy: Anatomy) -> Morphology:
     """Measure the parent artery and its aneurysms.
 
-    Height, aspect ratio and size ratio follow Dhar et al. 2008. The height is measured perpendicular to the neck plane.
-    The size ratio uses the longest distance from the center of the neck to the dome. The neck diameter in the aspect
-    ratio is twice the mean distance from the center of the neck to its rim.
+    Heights, widths, perimeter, aspect ratio, size ratio, inflow angle and the shape indices refer to the neck plane
+    (`vstent.anatomy.restore.plane`). Height, aspect ratio and size ratio follow Dhar et al. 2008. The height is
+    perpendicular to the plane. The size ratio uses the longest distance from the center of the section to the dome. The
+    neck diameter in the aspect ratio is twice the mean distance from that center to the rim of the section.
 
-    Volume and area are those of the sac closed across the curved neck. Most of the literature cuts the sac by a plane
-    instead (Raghavan et al. 2005). For comparison, the volume beyond the neck plane and the area of the section are
-    listed too. That plane passes through the center of the neck, perpendicular to its vector area. The section is left
-    out where the artery's wall rises through the plane and divides it.
+    Volume and area of the sac, and the projection and the surface of the neck, are those of the sac as it is closed: by
+    the wall of its artery, or by the plane at a fork. Most of the literature cuts every sac by a plane (Raghavan et al.
+    2005): the volume beyond the plane and the area of the section are listed too, with the range of areas of the planes
+    that separate the sac nearly as well. A neck drawn by hand has the mean plane of its curve. There the area of the
+    section is left out where the artery's wall rises through the plane and divides it.
 
     The shape indices of Raghavan et al. 2005 are those of the sac beyond the neck plane (`vstent.anatomy.shape`). The
     inflow angle (Baharoglu et al. 2010) lies between the parent axis over one diameter before the neck and the line
@@ -107,15 +109,12 @@ def _course(anatomy: Anatomy) -> Measures:
 
 def _sac(aneurysm: Aneurysm, axis: Centerline, parent_diameter_mm: float) -> Measures:
     """Return the measures of a sac and its neck."""
-    rim_mm, dome_mm = aneurysm.neck_mm, aneurysm.sac.vertices_mm
-    center_mm = triangles.polygon_centroid(rim_mm)
-    vector_mm2 = triangles.polygon_area_vector(rim_mm)
-    neck_area_mm2 = float(np.linalg.norm(vector_mm2))
-    normal = vector_mm2 / neck_area_mm2 * np.sign((dome_mm.mean(axis=0) - center_mm) @ vector_mm2)
+    plane, dome_mm = _plane_of(aneurysm), aneurysm.sac.vertices_mm
+    center_mm, normal = plane.center_mm, plane.normal
     height_mm = float(((dome_mm - center_mm) @ normal).max())
     reach_mm = float(np.linalg.norm(dome_mm - center_mm, axis=1).max())
-    neck_mean_mm = float(2 * np.linalg.norm(rim_mm - center_mm, axis=1).mean())
-    width_mm = _widths_mm(rim_mm, normal)
+    neck_mean_mm = float(2 * np.linalg.norm(plane.rim_mm - center_mm, axis=1).mean())
+    width_mm = _widths_mm(plane.rim_mm, normal)
     beyond = beyond_plane(aneurysm, center_mm, normal)
     found: Measures = {
         "sac_volume_mm3": abs(aneurysm.sac.volume_mm3),
@@ -124,9 +123,9 @@ def _sac(aneurysm: Aneurysm, axis: Centerline, parent_diameter_mm: float) -> Mea
         "sac_max_height_mm": reach_mm,
         "sac_max_diameter_mm": _diameter_mm(dome_mm),
         "sac_plane_volume_mm3": beyond.volume_mm3,
-        "neck_area_mm2": neck_area_mm2,
+        "neck_area_mm2": float(np.linalg.norm(triangles.polygon_area_vector(aneurysm.neck_mm))),
         "neck_surface_area_mm2": aneurysm.neck.area_mm2,
-        "neck_perimeter_mm": triangles.perimeter(rim_mm),
+        "neck_perimeter_mm": triangles.perimeter(plane.rim_mm),
         "neck_min_diameter_mm": float(width_mm.min()),
         "neck_max_diameter_mm": float(width_mm.max()),
         "aspect_ratio": height_mm / neck_mean_mm,
@@ -134,9 +133,24 @@ def _sac(aneurysm: Aneurysm, axis: Centerline, parent_diameter_mm: float) -> Mea
         **shape_indices(beyond, normal),
         **_inflow_angle(aneurysm, axis, center_mm, parent_diameter_mm),
     }
-    if beyond.section_mm2 > PARTED * neck_area_mm2:
+    if aneurysm.plane is not None:
+        low_mm2, high_mm2 = plane.area_band_mm2
+        found |= {"neck_plane_area_mm2": plane.area_mm2}
+        found |= {"neck_plane_area_low_mm2": low_mm2, "neck_plane_area_high_mm2": high_mm2}
+    elif beyond.section_mm2 > PARTED * plane.area_mm2:
         found["neck_plane_area_mm2"] = beyond.section_mm2
     return found
+
+
+def _plane_of(aneurysm: Aneurysm) -> NeckPlane:
+    """Return the neck plane; the mean plane of the neck curve where no plane separates the sac from all arteries."""
+    if aneurysm.plane is not None:
+        return aneurysm.plane
+    rim_mm = aneurysm.neck_mm
+    vector_mm2 = triangles.polygon_area_vector(rim_mm)
+    area_mm2 = float(np.linalg.norm(vector_mm2))
+    inward = aneurysm.sac.vertices_mm.mean(axis=0) - triangles.polygon_centroid(rim_mm)
+    return NeckPlane(vector_mm2 / area_mm2 * np.sign(inward @ vector_mm2), rim_mm, (area_mm2, area_mm2))
 
 
 def _inflow_angle(
@@ -156,10 +170,7 @@ def _inflow_angle(
 
 def _diameter_mm(points_mm: Floats) -> float:
     """Return the largest distance between points (n, 3) that are outermost in one of 600 directions."""
-    turn = np.pi * (3 - np.sqrt(5)) * np.arange(600)
-    z = np.linspace(-1, 1, 600)
-    directions = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=1)
-    outermost = np.unique((points_mm @ directions.T).argmax(axis=0))
+    outermost = np.unique((points_mm @ curves.directions(600).T).argmax(axis=0))
     return float(pdist(points_mm[outermost]).max())
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from vstent.errors import InputError
 from vstent.geometry.surface import Surface
-from vstent.kernels import curves
+from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Bools, Floats, freeze
 from vstent.units import place
 
@@ -151,6 +151,32 @@ class Vessel:
 
 
 @dataclass(frozen=True, eq=False)
+class NeckPlane:
+    """The plane that separates a sac from all arteries, at which sacs are compared and sized."""
+
+    normal: Floats
+    """(3,) unit normal, toward the dome."""
+    rim_mm: Floats
+    """(k, 3) closed curve in which it cuts the wall (the last point joins the first)."""
+    area_band_mm2: tuple[float, float]
+    """Smallest and largest area of the sections by planes that separate them nearly as well."""
+
+    def __post_init__(self) -> None:
+        freeze(self, "normal", np.float64, (3,))
+        freeze(self, "rim_mm", np.float64, (-1, 3))
+
+    @property
+    def center_mm(self) -> Floats:
+        """(3,) centroid of the section."""
+        return triangles.polygon_centroid(self.rim_mm)
+
+    @property
+    def area_mm2(self) -> float:
+        """Area of the section."""
+        return float(np.linalg.norm(triangles.polygon_area_vector(self.rim_mm)))
+
+
+@dataclass(frozen=True, eq=False)
 class Aneurysm:
     """A sac and the neck that connects it to the artery."""
 
@@ -160,6 +186,8 @@ class Aneurysm:
     """The surface that closes the sac; its normals point into the sac."""
     neck_mm: Floats
     """(k, 3) closed curve where the sac leaves the artery (the last point joins the first)."""
+    plane: NeckPlane | None = None
+    """Plane of the neck; None where no plane separates the sac from all arteries."""
 
     def __post_init__(self) -> None:
         freeze(self, "neck_mm", np.float64, (-1, 3))

@@ -164,6 +164,13 @@ def _derivatives(points: Floats, window: int, step: float) -> list[Floats]:
     return found
 
 
+def directions(n: int) -> Floats:
+    """Return `n` unit vectors (n, 3), evenly spread over all directions."""
+    turn = np.pi * (3 - np.sqrt(5)) * np.arange(n)
+    z = np.linspace(-1, 1, n)
+    return np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=1)
+
+
 def any_perpendicular(direction: Floats) -> Floats:
     """Return a unit vector (3,) perpendicular to a unit vector (3,)."""
     helper = np.eye(3)[np.argmin(np.abs(direction))]

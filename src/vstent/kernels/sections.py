@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from vstent.kernels import triangles
-from vstent.kernels.arrays import Floats, Ints
+from vstent.kernels.arrays import Bools, Floats, Ints
 
 
 class Sheet(NamedTuple):
@@ -50,7 +50,7 @@ def sheet(vertices: Floats, faces: Ints, weights: Floats) -> Sheet:
     return Sheet(np.array(vertices, order="C"), np.array(faces, dtype=np.int32, order="C"), across, terms)
 
 
-def beyond(mesh: Sheet, seed: int, points: Floats, normals: Floats) -> tuple[Floats, Ints]:
+def beyond(mesh: Sheet, seed: int, points: Floats, normals: Floats) -> tuple[Floats, Bools]:
     """Measure the part of a mesh that each of several planes cuts off.
 
     The part is the wall beyond the plane that is connected to a face. It includes pouches that hang back through the
@@ -69,8 +69,8 @@ def beyond(mesh: Sheet, seed: int, points: Floats, normals: Floats) -> tuple[Flo
     -------
     measures : (k, 2 + w)
         Volume of the part closed by the plane, area of its section, and its weighted areas.
-    open : (k,)
-        Number of open edges of the mesh in it; -1 where the face is not beyond the plane.
+    is_closed : (k,)
+        Whether the plane cuts off a part without open edges of the mesh; without one, the measures are not complete.
     """
     rows = np.ascontiguousarray(points), np.ascontiguousarray(normals)
     return _beyond(*mesh, seed, *rows)
@@ -80,8 +80,8 @@ def beyond(mesh: Sheet, seed: int, points: Floats, normals: Floats) -> tuple[Flo
 def _beyond(
     vertices: Any, faces: Any, neighbours: Any, terms: Any, seed: int, points: Any, normals: Any
 ) -> tuple[Any, Any]:
-    """Return the measures (k, 2 + w) and the number of open edges (k,) of the part beyond each plane."""
-    measures, n_open = np.zeros((len(points), terms.shape[1] - 2)), np.full(len(points), -1)
+    """Return the measures (k, 2 + w) of the part beyond each plane, and whether it has no open edge (k,)."""
+    measures, is_closed = np.zeros((len(points), terms.shape[1] - 2)), np.zeros(len(points), dtype=np.bool_)
     height = np.zeros(len(vertices))
     seen, stack, kept = np.zeros((3, len(faces)), dtype=np.int32)
     shares = np.zeros((len(faces), terms.shape[1]))
@@ -96,10 +96,10 @@ def _beyond(
         # 0: not reached, 1: reached, 2: cut by the plane.
         seen[:] = 0
         total[:] = 0.0
-        n_open[k] = 0
+        is_closed[k] = True
         stack[0], n, n_cut = seed, 1, 0
         seen[seed] = 1
-        while n > 0:
+        while n > 0 and is_closed[k]:
             n -= 1
             f = stack[n]
             if min(height[faces[f, 0]], height[faces[f, 1]], height[faces[f, 2]]) > 0.0:
@@ -114,17 +114,17 @@ def _beyond(
                 if max(height[faces[f, i]], height[faces[f, (i + 1) % 3]]) > 0.0:
                     g = neighbours[f, i]
                     if g < 0:
-                        n_open[k] += 1
+                        is_closed[k] = False
                     elif seen[g] == 0:
                         seen[g] = 1
                         stack[n] = g
                         n += 1
-        if n_open[k] == 0:
+        if is_closed[k]:
             _add_pouches(faces, neighbours, terms, height, seen, stack, kept[:n_cut], shares, total)
         measures[k, 0] = (total[0] - 2.0 * (p[0] * total[1] + p[1] * total[2] + p[2] * total[3])) / 6.0
         measures[k, 1] = q[0] * total[1] + q[1] * total[2] + q[2] * total[3]
         measures[k, 2:] = total[4:]
-    return measures, n_open
+    return measures, is_closed
 
 
 @njit(cache=True)

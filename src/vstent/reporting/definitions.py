@@ -32,9 +32,7 @@ DEFINITIONS: Final[dict[str, Definition]] = {
         ("Mean diameter of the parent artery over 5 mm distal to the neck (circle of the same area)."),
     ),
     "sac_volume_mm3": Definition("Sac volume", "Volume of the lumen beyond the neck."),
-    "sac_plane_volume_mm3": Definition(
-        "Sac volume, plane cut", "Volume of the sac beyond the mean plane of the neck curve.", _RAGHAVAN
-    ),
+    "sac_plane_volume_mm3": Definition("Sac volume, plane cut", "Volume of the sac beyond the neck plane.", _RAGHAVAN),
     "sac_area_mm2": Definition("Sac wall area", "Area of the sac's wall, without the neck."),
     "sac_height_mm": Definition(
         "Sac height", ("Largest distance of the dome from the neck plane, perpendicular to it."), _DHAR
@@ -46,13 +44,20 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     "neck_area_mm2": Definition("Neck area", "Area enclosed by the neck curve, projected on its mean plane."),
     "neck_plane_area_mm2": Definition(
         "Neck area, plane cut",
-        "Area of the largest section of the sac by the neck plane; missing where the artery wall divides that section.",
+        "Area of the section by the neck plane, which separates the sac from all arteries with the least surface for "
+        "its volume.",
         _RAGHAVAN,
     ),
+    "neck_plane_area_low_mm2": Definition(
+        "Neck area, plane cut, from", "Smallest area of the sections by planes that separate the sac nearly as well."
+    ),
+    "neck_plane_area_high_mm2": Definition(
+        "Neck area, plane cut, to", "Largest area of the sections by planes that separate the sac nearly as well."
+    ),
     "neck_surface_area_mm2": Definition("Neck surface", "Area of the restored wall that closes the neck."),
-    "neck_perimeter_mm": Definition("Neck perimeter", "Length of the neck curve."),
-    "neck_min_diameter_mm": Definition("Neck width, smallest", "Smallest width of the neck curve in its mean plane."),
-    "neck_max_diameter_mm": Definition("Neck width, largest", "Largest width of the neck curve in its mean plane."),
+    "neck_perimeter_mm": Definition("Neck perimeter", "Length of the rim of the neck plane's section."),
+    "neck_min_diameter_mm": Definition("Neck width, smallest", "Smallest width of the neck plane's section."),
+    "neck_max_diameter_mm": Definition("Neck width, largest", "Largest width of the neck plane's section."),
     "aspect_ratio": Definition("Aspect ratio", "Sac height divided by the mean diameter of the neck.", _DHAR),
     "size_ratio": Definition("Size ratio", "Longest sac height divided by the parent artery's diameter.", _DHAR),
     "undulation_index": Definition(

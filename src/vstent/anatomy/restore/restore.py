@@ -7,6 +7,7 @@ surrounding wall closes it (`landing`). The sac is the lumen outside that tube t
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -18,18 +19,25 @@ from vstent.anatomy.restore.candidates import classified
 from vstent.anatomy.restore.drawn import Drawn, cut_along
 from vstent.anatomy.restore.landing import Landing, close_landing
 from vstent.anatomy.restore.notes import candidates_told, flat_told, told
-from vstent.anatomy.restore.path import parent_path
-from vstent.anatomy.restore.sac import cut_sac, drawn_sac, is_in_one
-from vstent.anatomy.restore.tubes import tubes_of
+from vstent.anatomy.restore.path import PASSING, parent_path, reach_of
+from vstent.anatomy.restore.plane import plane_sac
+from vstent.anatomy.restore.sac import cut_sac, drawn_sac, is_beside_branch, is_in_one, is_sac
+from vstent.anatomy.restore.tubes import Tubes, tubes_of
 from vstent.errors import InputError, VesselError
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import PARENT, Anatomy, Aneurysm, Candidate, Centerline, Path, Vessel
+from vstent.kernels import triangles
 from vstent.kernels.arrays import Floats
 from vstent.units import place
 
 ON_FOOT: Final = 1.5
 """Points of a bulge's foot up to this many artery radii above the artery are on that artery. A foot rises to half a
 radius above the nearest artery."""
+OFF_PLANE: Final = 1 / 3
+"""A neck beside a branch follows the arteries' wall if it is within this many neck diameters of the neck plane."""
+NECK_SEEN: Final = 0.5
+"""A neck beside a branch follows the arteries' wall if its projection has at least this fraction of the area of the
+section by the neck plane."""
 MOST_FLAT: Final = 3
 """Number of flat bulges that are examined at most: one on a branch takes as long as restoring the artery."""
 
@@ -92,10 +100,9 @@ def _closed(
     """Return the index of the parent artery's centerline, its landing surface, and the sacs cut off from it."""
     path = parent_path(vessel, list(bulges), outlet_mm)
     landing = _landing(vessel, path, bulges, drawn.artery if drawn else None)
-    side_lines = _all_but(path, vessel.centerlines)
     if drawn:
-        return path, landing, [drawn_sac(vessel, landing, side_lines, drawn)]
-    return path, landing, _sacs(vessel, landing, side_lines, list(bulges))
+        return path, landing, [drawn_sac(vessel, landing, _all_but(path, vessel.centerlines), drawn)]
+    return path, landing, _sacs(vessel, path, landing, list(bulges))
 
 
 def _classified(vessel: Vessel, landing: Landing, sac: Aneurysm) -> Candidate:
@@ -138,14 +145,38 @@ def _all_but(path: int, lines: Sequence[Centerline]) -> list[Centerline]:
     return [line for k, line in enumerate(lines) if k != path]
 
 
-def _sacs(vessel: Vessel, landing: Landing, side_lines: list[Centerline], bulges: list[Bulge]) -> list[Aneurysm]:
+def _sacs(vessel: Vessel, path: int, landing: Landing, bulges: list[Bulge]) -> list[Aneurysm]:
     """Return the sacs of those bulges that are on the parent artery and not flat."""
-    found: list[Aneurysm] = []
+    tubes, found = tubes_of(vessel.centerlines), list[Aneurysm]()
     for bulge in bulges:
-        sac = cut_sac(vessel, landing, side_lines, bulge)
+        sac = _sac(vessel, path, landing, tubes, bulge)
         # Bulges that are separate above the tubes may be one sac above the landing surface, which is lower.
         found += [] if sac is None or is_in_one(sac.sac.vertices_mm, found) else [sac]
     return found
+
+
+def _sac(vessel: Vessel, path: int, landing: Landing, tubes: Tubes, bulge: Bulge) -> Aneurysm | None:
+    """Return the sac of a bulge, closed by the wall of its arteries or by its neck plane; None where it is no sac."""
+    side_lines = _all_but(path, vessel.centerlines)
+    curved, flat = cut_sac(vessel, landing, side_lines, bulge), plane_sac(vessel.lumen, tubes, bulge)
+    if flat is None:
+        return curved
+    if curved is None:
+        is_on_artery = reach_of(vessel.centerlines[path], bulge) <= PASSING
+        return flat if is_on_artery and is_sac(flat) else None
+    # Where branches leave under a sac, no single wall passes below it, and the curve may follow one of them.
+    if is_beside_branch(landing, side_lines, bulge) and not _agree(curved, flat):
+        return flat
+    return replace(curved, plane=flat.plane)
+
+
+def _agree(curved: Aneurysm, flat: Aneurysm) -> bool:
+    """Return whether the curved neck of a sac is near its plane and as wide as the section there."""
+    assert flat.plane is not None
+    off_mm = np.abs((curved.neck_mm - flat.plane.center_mm) @ flat.plane.normal).max()
+    seen_mm2 = abs(triangles.polygon_area_vector(curved.neck_mm) @ flat.plane.normal)
+    area_mm2 = flat.plane.area_mm2
+    return bool(off_mm < OFF_PLANE * np.sqrt(4 * area_mm2 / np.pi) and seen_mm2 > NECK_SEEN * area_mm2)
 
 
 def _foot_on(line: Centerline, bulge: Bulge) -> Floats:

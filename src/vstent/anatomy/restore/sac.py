@@ -86,8 +86,35 @@ def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], 
             mouths = [flank.rim, *other_loops[:k], *other_loops[k + 1 :]]
             other = _cut_off(vessel, artery, flank._replace(rim=loop), mouths, low_mm)
             found = max(found, other, key=lambda one: one.neck.area_mm2)
-    is_flat = found.sac.volume_mm3 < FLAT * found.neck.area_mm2**1.5
-    return None if is_flat or _roundness(found.sac) < ROUND else found
+    return found if is_sac(found) else None
+
+
+def is_sac(aneurysm: Aneurysm) -> bool:
+    """Return whether a shape that was cut off is neither flat nor debris of the scan.
+
+    Parameters
+    ----------
+    aneurysm : shape and neck.
+    """
+    is_flat = aneurysm.sac.volume_mm3 < FLAT * aneurysm.neck.area_mm2**1.5
+    return not is_flat and _roundness(aneurysm.sac) >= ROUND
+
+
+def is_beside_branch(landing: Landing, side_lines: Sequence[Centerline], bulge: Bulge) -> bool:
+    """Return whether a branch leaves the parent artery under a bulge or beside it.
+
+    Parameters
+    ----------
+    landing : landing surface of the parent artery.
+    side_lines : centerlines other than that of the parent artery.
+    bulge : part of the wall that may be a sac.
+    """
+    foot = cKDTree(bulge.foot_mm)
+    for line in side_lines:
+        is_apart = landing.solid.signed_distance(line.points_mm) > -0.5 * line.inscribed_radius_mm
+        if (is_apart & (foot.query(line.points_mm)[0] < PASSING * line.inscribed_radius_mm)).any():
+            return True
+    return False
 
 
 def _cut_off(vessel: Vessel, artery: Artery, flank: Flank, other_loops: list[Ints], low_mm: float) -> Aneurysm:
