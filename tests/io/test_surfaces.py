@@ -4,6 +4,7 @@ import sys
 import numpy as np
 import pytest
 
+from vstent.anatomy.repair import repair
 from vstent.devices.stent import tube_faces
 from vstent.errors import ReadError, UnitError
 from vstent.geometry.surface import Surface
@@ -338,3 +339,106 @@ def test_two_arteries_side_by_side_or_one_with_caps_are_no_hollow_model(tmp_path
         found, notes = read_surface(tmp_path / "a.stl")
         assert len(found.faces) == len(surface.faces)
         assert not any("wall" in note for note in notes)
+
+
+# -- dialects ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        str.upper,
+        str.title,
+        lambda text: "\ufeff" + text.replace("\n", "\r\n"),
+        lambda text: text.replace(".", ","),
+        lambda text: text.replace("\n ", "\n\t\t").upper(),
+    ],
+    ids=["capitals", "title", "windows", "commas", "tabs"],
+)
+def test_dialects_of_stl_text_give_the_same_triangles(tmp_path, spoil):
+    path = vtk_write(tmp_path / "a.stl", cylinder(), ascii_text=True)
+    path.write_text(spoil(path.read_text()), newline="")
+    read, _ = read_surface(path, units="mm")
+    np.testing.assert_allclose(triangles_of(read), triangles_of(cylinder()), atol=2e-3)
+
+
+def strips_of(rows, columns):
+    """Return one strip (vertex numbers) for every ring of a cylinder."""
+    around = np.arange(columns + 1) % columns
+    return [np.stack([k * columns + around, (k + 1) * columns + around], axis=1).ravel() for k in range(rows - 1)]
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("is_one_list", [True, False])
+def test_strips_of_a_ply_file_are_triangles(tmp_path, kind, is_one_list):
+    surface, strips = cylinder(), strips_of(13, 24)
+    if is_one_list:  # strips end with -1
+        strips = [np.concatenate([np.append(strip, -1) for strip in strips])[:-1]]
+    head = (
+        f"ply\nformat {kind} 1.0\nelement vertex {len(surface.vertices_mm)}\nproperty float x\nproperty float y\n"
+        f"property float z\nproperty uchar red\nelement tristrips {len(strips)}\n"
+        "property list int int vertex_indices\nend_header\n"
+    )
+    if kind == "ascii":
+        rows = [f"{x} {y} {z} 7" for x, y, z in surface.vertices_mm.tolist()]
+        rows += [" ".join(map(str, [len(strip), *strip])) for strip in strips]
+        body = "\n".join([*rows, ""]).encode()
+    else:
+        order = "<" if "little" in kind else ">"
+        vertices = np.zeros(len(surface.vertices_mm), [("p", f"{order}f4", 3), ("red", "u1")])
+        vertices["p"] = surface.vertices_mm
+        words = np.concatenate([[len(strip), *strip] for strip in strips])
+        body = vertices.tobytes() + words.astype(f"{order}i4").tobytes()
+    (tmp_path / "a.ply").write_bytes(head.encode() + body)
+    read, _ = read_surface(tmp_path / "a.ply", units="mm")
+    assert len(read.faces) == len(surface.faces)
+    assert read.area_mm2 == pytest.approx(surface.area_mm2, rel=1e-6)
+    outward = np.einsum("ij,ij->i", read.normals[:, :2], read.corners_mm.mean(axis=1)[:, :2])
+    assert (outward > 0).all() or (outward < 0).all()  # every second triangle of a strip is turned
+
+
+def apart(surface, width_mm, *, scale=1.0):
+    """Return a surface whose triangles share no vertices and miss each other by up to a width."""
+    offset = np.random.default_rng(1).uniform(-0.5, 0.5, (len(surface.faces), 3, 3)) * width_mm / np.sqrt(3)
+    corners = (surface.corners_mm + offset).reshape(-1, 3) * scale
+    return Surface(corners, np.arange(len(corners)).reshape(-1, 3))
+
+
+@pytest.mark.parametrize(("width_mm", "scale"), [(4e-4, 1.0), (4e-4, 1e-3), (3e-5, 1.0), (0.01, 1.0)])
+def test_triangles_that_miss_each_other_by_little_are_one_wall(tmp_path, width_mm, scale):
+    write_surface(tmp_path / "a.vtp", apart(cylinder(), width_mm, scale=scale))
+    read, notes = read_surface(tmp_path / "a.vtp")
+    assert ("mm" if scale == 1.0 else "unit: m,") in notes[0]
+    assert hydraulic_diameter(read) == pytest.approx(hydraulic_diameter(cylinder()), rel=0.01)
+    whole, repairs = repair(read)
+    assert len(whole.boundary_loops) == 2
+    assert len(whole.vertices_mm) == len(cylinder().vertices_mm)
+    assert any("do not meet" in note for note in repairs) or width_mm < 1e-4
+
+
+def test_solids_that_miss_each_other_along_a_seam_are_joined(tmp_path):
+    surface = cylinder()
+    half = len(surface.faces) // 2
+    parts = [surface.faces[:half], surface.faces[half:] + len(surface.vertices_mm)]
+    vertices = np.concatenate([surface.vertices_mm, surface.vertices_mm + 2e-4])
+    write_surface(tmp_path / "a.vtp", Surface(vertices, np.concatenate(parts)))
+    whole, repairs = repair(read_surface(tmp_path / "a.vtp", units="mm")[0])
+    assert len(whole.boundary_loops) == 2
+    assert whole.area_mm2 == pytest.approx(surface.area_mm2, rel=1e-3)
+    assert any("do not meet" in note for note in repairs)
+
+
+def test_the_openings_of_a_sound_surface_are_no_cracks():
+    for surface in (cylinder(columns=400), cylinder(radius=2.0, columns=8)):
+        assert not any("do not meet" in note for note in repair(surface)[1])
+
+
+@pytest.mark.parametrize("name", ["/etc/passwd.vtp", "../a.vtp", r"C:\a.vtp"])
+def test_only_blocks_beside_a_multi_block_file_are_read(tmp_path, name):
+    write_surface(tmp_path / "a.vtp", cylinder())
+    (tmp_path / "here").mkdir()
+    file = tmp_path / "here" / "a.vtm"
+    head = '<VTKFile type="vtkMultiBlockDataSet" version="1.0"><vtkMultiBlockDataSet>'
+    file.write_text(f'{head}<DataSet index="0" file="{name}"/></vtkMultiBlockDataSet></VTKFile>')
+    with pytest.raises(ReadError, match="Only files beside it or below are read"):
+        read_surface(file)

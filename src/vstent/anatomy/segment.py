@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.special import ndtr
 
-from vstent.anatomy.bulge import bulging, prominence
+from vstent.anatomy.bulge import COMPARABLE, bulging, prominence
 from vstent.anatomy.masks import prepared
 from vstent.errors import VesselError
 from vstent.geometry.image import Image
@@ -86,6 +86,8 @@ def segment(image: Image, *, threshold: float | None = None, at_mm: Floats | Non
     size = " x ".join(f"{h:.3g}" for h in image.spacing_mm)
     share = lumen.n_voxels / lumen.n_above
     found = f"The lumen has {lumen.n_voxels} voxels of {size} mm, {share:.0%} of all voxels above the threshold."
+    if lumen.others_mm:
+        found += f" Another object of similar size lies about {place(lumen.others_mm[0])}: --at chooses it."
     # The uncertainty is relative to the step, not to the threshold, because the zero of a scan's intensities is
     # arbitrary.
     off = BAND * (profile.lumen - profile.tissue)
@@ -117,6 +119,8 @@ class Lumen:
     """Number of voxels in the vessel."""
     n_above: int
     """Number of voxels of the whole scan above the threshold."""
+    others_mm: tuple[Floats, ...] = ()
+    """Centers (3,) of other objects of similar size, in LPS mm."""
 
     @property
     def voxel_mm(self) -> float:
@@ -291,7 +295,9 @@ def _lumen(image: Image, threshold: float, at_mm: Floats | None) -> Lumen:
     field[(part > 0) & (part != chosen)] = below
     affine = np.array(image.affine_mm)
     affine[:3, 3] = image.to_mm(np.array([[s.start for s in box]]))[0]
-    return Lumen(field, affine, threshold, int(size[chosen]), int(size.sum()))
+    others = [k for k in np.flatnonzero(size > COMPARABLE * size.max()) if k != chosen]
+    middles = [image.to_mm(np.array(ndimage.center_of_mass(label == k))[None])[0] for k in others]
+    return Lumen(field, affine, threshold, int(size[chosen]), int(size.sum()), tuple(middles))
 
 
 def _box(label: NDArray[Any], number: int) -> tuple[slice, ...]:

@@ -1,5 +1,6 @@
 """Read surface files (STL, VTP, VTU, VTM, VTK, OBJ, PLY) as a `Surface` in LPS mm."""
 
+import codecs
 import os
 import re
 from pathlib import Path
@@ -153,7 +154,9 @@ def _refuse_mislabelled(path: Path, kind: str) -> None:
 
 def _is_ascii_stl(head: bytes) -> bool:
     """Return whether a file starts like an STL text file."""
-    return head.lstrip().lower().startswith(b"solid") and (b"facet" in head.lower() or len(head) == 512)
+    return head.removeprefix(codecs.BOM_UTF8).lstrip().lower().startswith(b"solid") and (
+        b"facet" in head.lower() or len(head) == 512
+    )
 
 
 def _is_binary_stl(path: Path, head: bytes) -> bool:

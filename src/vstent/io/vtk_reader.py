@@ -1,5 +1,6 @@
 """Read surfaces and images with VTK's readers, which a damaged file may crash: only `vstent.io.child` calls them."""
 
+import codecs
 import re
 from pathlib import Path, PureWindowsPath
 from tempfile import TemporaryDirectory
@@ -123,7 +124,7 @@ def _plain_stl(path: Path, folder: Path) -> Path:
     if suffix(path) != ".stl":
         return path
     data = path.read_bytes()
-    plain = data.lower().replace(b",", b".")
+    plain = data.removeprefix(codecs.BOM_UTF8).lower().replace(b",", b".")
     if plain == data or b"\0" in data or not plain.lstrip().startswith(b"solid"):
         return path
     (folder / path.name).write_bytes(plain)

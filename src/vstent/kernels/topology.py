@@ -72,7 +72,7 @@ def without_cracks(vertices: Floats, faces: Ints) -> tuple[Ints, float]:
     faces : (m, 3)
         Faces on the vertices that are kept.
     width : float
-        Smallest width that closes nearly all cracks that can be closed; 0 where nothing was merged.
+        Smallest width at which most edges meet; 0 where nothing was merged.
     """
     edges = edges_of(faces)
     single = edges.starts[edges.n_uses == 1]
@@ -89,7 +89,7 @@ def without_cracks(vertices: Floats, faces: Ints) -> tuple[Ints, float]:
     closed = np.array([_n_meeting(label[place]) for label in labels])
     if closed.max() < CLOSED * len(rims):
         return faces, 0.0
-    best = int(np.argmax(closed >= 0.95 * closed.max()))
+    best = int(np.argmax(closed))  # the first of equals
     _, first, group = np.unique(labels[best], return_index=True, return_inverse=True)
     same = np.arange(len(vertices))
     same[rim] = rim[first[group]]
