@@ -150,8 +150,12 @@ def _best(wall: Wall, bulge: Bulge) -> _Best | None:
     found = []
     for k in starts:
         frame = _Frame(points[k], normals[k])
+
+        def cost(x: Floats, frame: _Frame = frame) -> float:
+            return float(np.log(wall.ratios(*frame.planes(x[None]))[0][0]))
+
         result = minimize(
-            lambda x, frame=frame: float(np.log(wall.ratios(*frame.planes(x[None]))[0][0])),
+            cost,
             np.zeros(3),
             method="Nelder-Mead",
             options={
