@@ -6,7 +6,7 @@ This module imports no numpy, so that the help of the command line appears at on
 import math
 import re
 from collections.abc import Callable
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from functools import reduce
 from pathlib import Path
 from typing import Any, Final, get_args
@@ -15,12 +15,44 @@ from vstent.errors import InputError
 
 WORDS: Final = {"yes": True, "true": True, "1": True, "no": False, "false": False, "0": False}
 """Values of a flag in a table."""
-REQUIRED: Final[Any] = MISSING
-"""Default of a field that must be given."""
-LENGTH: Final[dict[str, Any]] = {"unit": "mm", "above": 0.0, "high": 1000.0}
-"""Unit and limits of a length."""
-POSITION: Final[dict[str, Any]] = {"unit": "mm", "low": -1e4, "high": 1e4}
-"""Unit and limits of a coordinate, or of a position along an artery."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Permitted values of a number, or of each of several."""
+
+    unit: str = ""
+    """Unit of the value."""
+    low: float = -math.inf
+    """Lowest value."""
+    high: float = math.inf
+    """Highest value."""
+    above: float = -math.inf
+    """Number that every value exceeds."""
+    remark: str = ""
+    """A conversion into the unit, such as 240 mL/min are 4 mL/s."""
+
+    def __str__(self) -> str:
+        """Return the permitted values with their unit; empty where all are."""
+        low = f"above {self.above:g}" if self.above > self.low else f"{self.low:g}" if self.low > -math.inf else ""
+        if math.isinf(self.high):
+            said = low if self.above > self.low or not low else f"at least {low}"
+        else:
+            said = f"{low}{', up' if self.above > self.low else ''} to {self.high:g}"
+        return f"{said} {self.unit}".strip() + (f" ({self.remark})" if self.remark else "")
+
+    def check(self, value: float) -> None:
+        """Raise InputError where a number is outside the limits."""
+        if not (self.low <= value <= self.high and self.above < value and math.isfinite(value)):
+            raise InputError(f"{value:g} {self.unit}".rstrip() + f" is out of range: give {self}")
+
+
+ANY: Final = Limits()
+"""Any number."""
+LENGTH: Final = Limits("mm", above=0.0, high=1000.0)
+"""Limits of a length."""
+POSITION: Final = Limits("mm", -1e4, 1e4)
+"""Limits of a position along an artery, or of the coordinates of points in the frame of the input."""
 
 
 def number(text: str) -> float:
@@ -66,6 +98,16 @@ def flag(text: str) -> bool:
     return WORDS[text.lower()]
 
 
+PLACEHOLDERS: Final[dict[Callable[[str], Any], str]] = {
+    whole: "N",
+    point: "X,Y,Z",
+    box: "X,Y,Z,X,Y,Z",
+    shape: "I,J,K",
+    spacing: "S|X,Y,Z",
+}
+"""Placeholders of values in the help of the command line, by what reads them."""
+
+
 def _parts(text: str) -> list[str]:
     """Return the parts of a text that are separated by commas, semicolons, spaces or x."""
     return re.split(r"\s*[,;x]\s*|\s+", text.strip())
@@ -93,22 +135,14 @@ class Option:
     """What it is, for the help of the command line."""
     read: Callable[[str], Any] = number
     """Reads a value from text."""
-    unit: str = ""
-    """Unit of the value."""
-    metavar: str = ""
-    """Placeholder of the value in the help; empty: the unit."""
+    limits: Limits = ANY
+    """Unit and permitted values of a number."""
     usual: str = ""
     """What is taken where it is not given."""
-    low: float = -math.inf
-    """Lowest value."""
-    high: float = math.inf
-    """Highest value."""
-    above: float = -math.inf
-    """Number that every value exceeds."""
+    metavar: str = ""
+    """Placeholder of the value in the help; empty: that of what is read, or the unit."""
     counts: tuple[int, int] | None = None
     """Lowest and highest number of points; None: any."""
-    remark: str = ""
-    """A conversion into the unit, such as 240 mL/min are 4 mL/s."""
     choices: tuple[str, ...] = ()
     """All values of a word; empty: any."""
     separators: str = ""
@@ -123,21 +157,11 @@ class Option:
     """Returns the setting that a value stands for, such as the content of a file; None: the value itself."""
     is_file: bool = False
     """Whether the value is the path of a file, unless it is `alone`."""
-    is_place: bool = False
-    """Whether the setting is a point, or several, in the frame of the input."""
 
     @property
-    def limits(self) -> str:
-        """The permitted values as text, with their unit."""
-        if self.low == self.above == -self.high:
-            return ""
-        is_open = self.above > self.low
-        said = f"above {self.above:g}" if is_open else f"{self.low:g}"
-        if math.isinf(self.high):
-            said = said if is_open else f"at least {said}"
-        else:
-            said += f"{', up' if is_open else ''} to {self.high:g}"
-        return f"{said} {self.unit}".rstrip() + (f" ({self.remark})" if self.remark else "")
+    def placeholder(self) -> str | None:
+        """Placeholder of the value in the help; None: the name of the option."""
+        return self.metavar or PLACEHOLDERS.get(self.read) or re.sub(r"[ /]", "_", self.limits.unit.upper()) or None
 
     def value(self, text: str) -> Any:
         """Return a value read from the command line.
@@ -177,11 +201,8 @@ class Option:
             A number is outside the limits, or there are too many or too few points.
         """
         if not isinstance(value, tuple | list):
-            is_bad = isinstance(value, int | float) and not (
-                self.low <= value <= self.high and self.above < value and math.isfinite(value)
-            )
-            if is_bad:
-                raise InputError(f"{value:g} {self.unit}".rstrip() + f" is out of range: give {self.limits}")
+            if isinstance(value, int | float):
+                self.limits.check(value)
             return value
         if self.counts and not (value and isinstance(value[0], int | float)):
             fewest, most = self.counts
@@ -191,21 +212,33 @@ class Option:
             self.check(one)
         return value
 
+    def checked(self, value: Any) -> Any:
+        """Do what `check` does, with the name of the option in the error."""
+        try:
+            return self.check(value)
+        except InputError as error:
+            raise InputError(f"{self.name.replace('-', ' ')}: {error}") from None
 
-def setting(default: Any, name: str, text: str, read: Callable[[str], Any] = number, **more: Any) -> Any:
+
+def setting(
+    default: Any,
+    name: str,
+    text: str,
+    read: Callable[[str], Any] = number,
+    limits: Limits = ANY,
+    usual: str = "",
+    **more: Any,
+) -> Any:
     """Return a field of a data class with an option.
 
     Parameters
     ----------
     default : default of the field, immutable.
-    name : name of the option.
-    text : what it is, for the help.
-    read : reads a value from text.
-    more : further fields of `Option`.
+    name, text, read, limits, usual, more : fields of `Option`; `usual` is the default where that is a number or a word.
     """
-    is_number = isinstance(default, int | float) and not isinstance(default, bool)
-    usual = more.pop("usual", f"{default:g}" if is_number else default if isinstance(default, str) else "")
-    return field(default=default, metadata={"option": Option(name, text, read, usual=usual, **more)})
+    is_said = isinstance(default, str | int | float) and not isinstance(default, bool)
+    usual = usual or (f"{default:g}" if isinstance(default, int | float) else str(default)) if is_said else usual
+    return field(default=default, metadata={"option": Option(name, text, read, limits, usual, **more)})
 
 
 def stated(kind: type) -> dict[str, Option]:
@@ -232,10 +265,7 @@ def at(section: Any, path: str) -> Any:
 def check_all(section: Any) -> None:
     """Raise InputError where a setting of a data class, or of those in it, is outside its limits."""
     for path, option in stated(type(section)).items():
-        try:
-            option.check(at(section, path))
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
+        option.checked(at(section, path))
 
 
 def differing(one: Any, other: Any) -> list[str]:

@@ -168,12 +168,12 @@ def test_the_numbers_of_the_device_vary_within_their_ranges():
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"samples": 1}, "at least 2"),
-        ({"flow_samples": -1}, "flow_samples of an uncertainty study: -1 is out of range: give at least 0"),
-        ({"landing_mm": -1.0}, "landing_mm"),
-        ({"landing_mm": float("nan")}, "landing_mm"),
-        ({"threshold_mm": float("inf")}, "threshold_mm"),
-        ({"device_mm": -0.1}, "device_mm"),
+        ({"samples": 1}, "give 2 to 4096"),
+        ({"flow_samples": -1}, "uncertainty flows: -1 is out of range: give at least 0"),
+        ({"landing_mm": -1.0}, "vary landing"),
+        ({"landing_mm": float("nan")}, "vary landing"),
+        ({"threshold_mm": float("inf")}, "vary threshold"),
+        ({"device_mm": -0.1}, "vary device"),
         ({"inflow_fraction": 1.0}, "give 0 to 0.99"),
         ({"numbers_factor": 1.5}, "give 0 to 1"),
     ],
@@ -298,7 +298,7 @@ def test_a_study_tells_its_uncertainty_in_metrics_report_and_table_and_goes_on_f
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--uncertainty", "1"], "--uncertainty: 1 is out of range: give at least 2"),
+        (["--uncertainty", "1"], "--uncertainty: 1 is out of range: give 2 to 4096"),
         (["--uncertainty-flows", "-1"], "--uncertainty-flows: -1 is out of range: give at least 0"),
         (["--vary-landing", "nan"], "--vary-landing: 'nan' is not a number"),
         (["--vary-device", "-1"], "--vary-device: -1 mm is out of range: give at least 0 mm"),

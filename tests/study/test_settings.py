@@ -117,7 +117,7 @@ def test_a_value_out_of_range_is_refused_alike_on_the_command_line_and_on_the_pa
 def test_a_size_of_a_treatment_out_of_range_is_refused_on_the_page() -> None:
     treatments = asdict(STATED["diameter"][1])["treatments"]
     treatments[0]["implants"][0]["diameter_mm"] = -4.0
-    with pytest.raises(InputError, match=r"diameter_mm: -4 mm is out of range: give above 0, up to 1000 mm"):
+    with pytest.raises(InputError, match=r"diameter: -4 mm is out of range: give above 0, up to 1000 mm"):
         Choices(treatments=treatments)
 
 

@@ -6,7 +6,6 @@ from typing import Annotated, Any, Final, Self, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model, field_validator, model_validator
 
 from vstent.devices.treatment import Treatment
-from vstent.errors import InputError
 from vstent.fields import POSITION, Option, check_all
 from vstent.flow.settings import FlowSettings, Numerics
 from vstent.flow.waveform import OLDER_ADULT_ICA, Waveform
@@ -16,7 +15,7 @@ from vstent.study.settings import AnatomySettings, InputSettings, Settings
 Section = TypeVar("Section", InputSettings, AnatomySettings, FlowSettings, Numerics)
 NECK_HANDLES: Final = 12
 """Number of evenly spaced handles on a neck."""
-Coordinate = Annotated[float, Field(ge=POSITION["low"], le=POSITION["high"], allow_inf_nan=False)]
+Coordinate = Annotated[float, Field(ge=POSITION.low, le=POSITION.high, allow_inf_nan=False)]
 """A coordinate in mm."""
 Point = tuple[Coordinate, Coordinate, Coordinate]
 """A point in LPS mm."""
@@ -36,20 +35,13 @@ def offered(kind: type, *without: str) -> dict[str, Any]:
     kind : the data class.
     without : names of settings that are left out.
     """
-    stated = [one for one in fields(kind) if "option" in one.metadata and one.name not in without]
-    return {one.name: (_limited(one.type, one.metadata["option"]), one.default) for one in stated}
-
-
-def _limited(kind: Any, option: Option) -> Any:
-    """Return the type of a field whose values are within the limits of an option."""
-
-    def check(value: Any) -> Any:
-        try:
-            return option.check(value)
-        except InputError as error:
-            raise InputError(f"{option.name.replace('-', ' ')}: {error}") from None
-
-    return Annotated[kind, AfterValidator(check), Field(description=f"{option.help}; {option.limits}".rstrip("; "))]
+    found = {}
+    for one in fields(kind):
+        if "option" in one.metadata and one.name not in without:
+            option: Option = one.metadata["option"]
+            about = Field(description=f"{option.help}; {option.limits}".rstrip("; "))
+            found[one.name] = Annotated[one.type, AfterValidator(option.checked), about], one.default
+    return found
 
 
 def changed(former: Section, model: BaseModel) -> Section:

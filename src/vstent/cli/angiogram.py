@@ -1,13 +1,12 @@
 """`vstent angiogram`: carry contrast through the flows of a finished case."""
 
 import argparse
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vstent.cli import options
 from vstent.cli.filming import add_film, given_film, given_study
-from vstent.fields import Option
+from vstent.fields import Limits
 
 if TYPE_CHECKING:
     from vstent.angiography.angiogram import AngiogramSettings
@@ -31,19 +30,18 @@ def add(commands: options.Commands) -> None:
 def add_injection(parser: argparse.ArgumentParser) -> None:
     """Add the options on the injection and on what is computed."""
     group = parser.add_argument_group("injection")
-    positive = partial(Option, above=0.0)
-    options.add_option(group, positive("iodine", "iodine", unit="mg/mL", usual="300"), default=300.0)
-    options.add_option(group, positive("amount", "injected volume", unit="mL", usual="3"), default=3.0)
-    options.add_option(group, positive("rate", "injection rate", unit="mL/s", usual="3"), default=3.0)
+    options.add_number(group, "iodine", "iodine", 300.0, Limits("mg/mL", above=0.0))
+    options.add_number(group, "amount", "injected volume", 3.0, Limits("mL", above=0.0))
+    options.add_number(group, "rate", "injection rate", 3.0, Limits("mL/s", above=0.0))
     start = "start of the injection; with a pulsatile flow the time since the start of the cycle"
-    options.add_option(group, Option("start", start, unit="s", low=0.0, high=60.0, usual="0"), default=0.0)
+    options.add_number(group, "start", start, 0.0, Limits("s", 0.0, 60.0))
     shape = group.add_mutually_exclusive_group()
     shape.add_argument("--gamma", action="store_true", help="gamma-variate injection curve (default: constant rate)")
     shape.add_argument(
         "--curve", type=Path, metavar="CSV", help="time (s) and iodine concentration at the inlet (mg/mL), two columns"
     )
     window = "time to compute from the start of the injection"
-    options.add_option(group, Option("window", window, unit="s", low=0.1, high=120.0, usual="6"), default=6.0)
+    options.add_number(group, "window", window, 6.0, Limits("s", 0.1, 120.0))
     group.add_argument("--preview", action="store_true", help="use a grid twice as coarse, for a first look")
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from vstent.cli import options
 from vstent.errors import InputError
-from vstent.fields import Option, whole
+from vstent.fields import Limits, Option, whole
 
 
 def add(commands: options.Commands) -> None:
@@ -27,7 +27,7 @@ def add(commands: options.Commands) -> None:
     group.add_argument(
         "--flavour", choices=("com", "org"), help="openfoam.com or openfoam.org (default: the one installed, else com)"
     )
-    layers = Option("layers", "prism layers along the wall", whole, metavar="N", low=0, usual="2")
+    layers = Option("layers", "prism layers along the wall", whole, Limits(low=0), "2", "N")
     options.add_option(group, layers, default=2)
     foam.set_defaults(command=_openfoam)
     patches = options.add_command(

@@ -1,12 +1,11 @@
 """Options on the films of an angiogram."""
 
 import argparse
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vstent.cli import options
-from vstent.fields import Option
+from vstent.fields import LENGTH, Limits
 
 if TYPE_CHECKING:
     from vstent.angiography.filming import FilmSettings
@@ -20,16 +19,15 @@ def add_film(parser: argparse.ArgumentParser) -> None:
         metavar="ANGLES",
         help='C-arm direction, such as "LAO 30 CRA 10", AP or lateral (default: the neck in profile, proposed)',
     )
-    positive = partial(Option, above=0.0)
-    options.add_option(group, positive("frame-rate", "frames per second", metavar="HZ", usual="7.5"), default=7.5)
+
+    options.add_number(group, "frame-rate", "frames per second", 7.5, Limits("Hz", above=0.0))
     group.add_argument("--wires", action="store_true", help="show the wires of the device (default: subtracted)")
     group.add_argument("--vessel", action="store_true", help="show the vessel faintly (default: subtracted)")
-    options.add_option(group, positive("pixel", "detector pixel", unit="mm", usual="0.154"), default=0.154)
-    to_detector = positive("source-detector", "distance from source to detector", unit="mm", usual="1100")
-    options.add_option(group, to_detector, default=1100.0)
+    options.add_number(group, "pixel", "detector pixel", 0.154, LENGTH)
+    options.add_number(group, "source-detector", "distance from source to detector", 1100.0, Limits("mm", above=0.0))
     to_vessel = "distance from source to isocenter, where the vessel is"
-    options.add_option(group, positive("source-isocenter", to_vessel, unit="mm", usual="750"), default=750.0)
-    options.add_option(group, positive("energy", "photon energy", unit="keV", usual="50"), default=50.0)
+    options.add_number(group, "source-isocenter", to_vessel, 750.0, Limits("mm", above=0.0))
+    options.add_number(group, "energy", "photon energy", 50.0, Limits("keV", above=0.0))
     group.add_argument(
         "--dicom-like",
         type=Path,

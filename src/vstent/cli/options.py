@@ -46,7 +46,7 @@ def add_option(group: "argparse._ActionsContainer", option: fields.Option, **mor
     option : the option.
     more : further arguments of argparse, such as a default.
     """
-    about = f"{option.help}, {option.unit}" if option.unit else option.help
+    about = f"{option.help}, {option.limits.unit}" if option.limits.unit else option.help
     about += f" (default: {option.usual})" if option.usual else ""
     about += "; repeat for several" if option.separators else ""
     names = [*([option.short] if option.short else []), f"--{option.name}"]
@@ -60,12 +60,19 @@ def add_option(group: "argparse._ActionsContainer", option: fields.Option, **mor
     if option.choices:
         kind["choices"] = option.choices
     else:
-        kind["metavar"] = option.metavar or re.sub(r"[ /]", "_", option.unit.upper()) or None
+        kind["metavar"] = option.placeholder
     if option.separators:
         kind["action"] = "append"
     if option.alone:
         kind |= {"nargs": "?", "const": option.alone}
     group.add_argument(*names, **kind | more)
+
+
+def add_number(
+    group: "argparse._ActionsContainer", name: str, text: str, default: float, limits: fields.Limits
+) -> None:
+    """Add an option that is a number, with its default."""
+    add_option(group, fields.Option(name, text, limits=limits, usual=f"{default:g}"), default=default)
 
 
 def add_settings(parser: argparse.ArgumentParser, *sections: str, without: Container[str] = ()) -> None:
@@ -145,7 +152,7 @@ def add_case(parser: argparse.ArgumentParser) -> None:
 
 def add_crew(group: "argparse._ArgumentGroup") -> None:
     """Add the number of parallel processes, and the clusters that may be used in their place."""
-    jobs = fields.Option("jobs", "parallel processes", fields.whole, metavar="N", low=1, usual="one per core")
+    jobs = fields.Option("jobs", "parallel processes", fields.whole, fields.Limits(low=1), "one per core", "N")
     add_option(group, jobs, default=cores())
     crew = group.add_mutually_exclusive_group()
     crew.add_argument("--scheduler", metavar="ADDRESS", help="use the workers of this Dask scheduler")

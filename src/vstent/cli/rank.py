@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from vstent.cli import options
-from vstent.fields import Option, numbers, whole
+from vstent.fields import Limits, Option, numbers, whole
 
 if TYPE_CHECKING:
     from vstent.cli.console import Console
@@ -31,9 +31,9 @@ def add(commands: options.Commands) -> None:
     ranking = parser.add_argument_group("ranking")
     ranking.add_argument("--criteria", type=Path, metavar="TOML", help="ranking criteria (default: vstent's own)")
     shift = "shifts from the proposed landing to try, mm, positive distally"
-    options.add_option(ranking, Option("shift", shift, numbers, metavar="MM,MM,...", usual="0"), default=(0.0,))
+    options.add_option(ranking, Option("shift", shift, numbers, usual="0", metavar="MM,MM,..."), default=(0.0,))
     flows = "compute the flow with the N best sizes, the best of each device among them"
-    options.add_option(ranking, Option("flow", flows, whole, metavar="N", low=1, usual="none"), dest="flow_count")
+    options.add_option(ranking, Option("flow", flows, whole, Limits(low=1), "none", "N"), dest="flow_count")
     ranking.add_argument(
         "--retention",
         action="store_true",

@@ -1,11 +1,11 @@
 """Data classes of what is planned for a patient: `Placing`, `Implant` and `Treatment`."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass
 from typing import Final, Literal, get_args
 
 from vstent.errors import InputError
-from vstent.fields import LENGTH, POSITION, REQUIRED, setting
+from vstent.fields import LENGTH, POSITION, setting
 
 Anchor = Literal["center", "distal", "proximal"]
 """Point of a device that is placed at the landing position."""
@@ -27,7 +27,11 @@ class Placing:
     path: str = "parent"
     """Name of the path in `Anatomy.paths`."""
     position_mm: float | None = setting(
-        None, "center", "position of the middle of every --device along the parent artery", usual="proposed", **POSITION
+        None,
+        "center",
+        "position of the middle of every --device along the parent artery",
+        limits=POSITION,
+        usual="proposed",
     )
     """Position of the anchor along the path, in mm."""
     anchor: Anchor = "center"
@@ -43,20 +47,20 @@ class Implant:
     id: str
     """Name within the treatment."""
     device: str = setting(
-        REQUIRED,
+        MISSING,
         "device",
-        "device of the catalogue, a treatment of its own",
+        "device of the catalogue",
         str,
-        metavar="NAME",
         usual="silk and enterprise",
+        metavar="NAME",
         separators=";, ",
     )
     """Key of the design in the catalogue."""
     diameter_mm: float | None = setting(
-        None, "diameter", "label diameter of every --device", usual="proposed", **LENGTH
+        None, "diameter", "label diameter of every --device", limits=LENGTH, usual="proposed"
     )
     """Label diameter in mm."""
-    length_mm: float | None = setting(None, "length", "label length of every --device", usual="proposed", **LENGTH)
+    length_mm: float | None = setting(None, "length", "label length of every --device", limits=LENGTH, usual="proposed")
     """Label length in mm."""
     placing: Placing = Placing()
     """Where it is placed."""

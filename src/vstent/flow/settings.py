@@ -6,7 +6,7 @@ This module imports no numpy, so that command-line options and settings of a stu
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
-from vstent.fields import flag, setting, whole
+from vstent.fields import Limits, flag, setting, whole
 from vstent.flow.waveform import PUBLISHED, Waveform, read_waveform
 
 if TYPE_CHECKING:
@@ -52,23 +52,14 @@ class Blood:
     """
 
     density_kg_m3: float = setting(
-        1060.0,
-        "density",
-        "density of blood",
-        unit="kg/m3",
-        low=900.0,
-        high=1200.0,
-        remark="1.06 g/mL are 1060 kg/m3",
+        1060.0, "density", "density of blood", limits=Limits("kg/m3", 900.0, 1200.0, remark="1.06 g/mL are 1060 kg/m3")
     )
     """Mass density."""
     viscosity_Pa_s: float = setting(
         0.004,
         "viscosity",
         "viscosity of blood",
-        unit="Pa s",
-        low=0.001,
-        high=0.1,
-        remark="4 mPa s are 0.004 Pa s",
+        limits=Limits("Pa s", 0.001, 0.1, remark="4 mPa s are 0.004 Pa s"),
         usual=f"0.004; with --shear-thinning {HIGH_SHEAR_VISCOSITY_PA_S:g} at high shear",
     )
     """Dynamic viscosity; with a shear-thinning law, its value at high shear rate."""
@@ -103,13 +94,7 @@ class Numerics:
     """How a flow is computed; its physics is in the other `FlowSettings`."""
 
     cell_size_mm: float | None = setting(
-        None,
-        "grid-spacing",
-        "spacing of the flow grid",
-        unit="mm",
-        usual="29 cells per diameter",
-        low=0.04,
-        high=1.0,
+        None, "grid-spacing", "spacing of the flow grid", limits=Limits("mm", 0.04, 1.0), usual="29 cells per diameter"
     )
     """Grid spacing; None: `cells_per_diameter` cells across the vessel, but at most `cell_budget` cells in all."""
     close_up: bool = setting(
@@ -140,7 +125,7 @@ class Numerics:
         LATTICE, "engine", "flow engine: lattice_boltzmann, openfoam, or a plug-in", str, metavar="NAME"
     )
     """Flow engine: ``lattice_boltzmann``, ``openfoam``, or the name of a plug-in (`vstent.plugins`)."""
-    processes: int = setting(1, "processes", "number of OpenFOAM processes", whole, short="-j", metavar="N", low=1)
+    processes: int = setting(1, "processes", "number of OpenFOAM processes", whole, Limits(low=1), short="-j")
     """Number of processes on this machine (OpenFOAM only)."""
     device_gpu: bool = setting(False, "gpu", "compute the flow on an NVIDIA GPU (needs the extra gpu)", flag)
     """Whether the embedded engine computes on a GPU (needs the extra ``gpu``); results differ in the last bits."""
@@ -154,11 +139,8 @@ class FlowSettings:
         None,
         "flow-rate",
         "mean inflow of all inlets",
-        unit="mL/s",
+        limits=Limits("mL/s", above=0.0, high=50.0, remark="240 mL/min are 4 mL/s"),
         usual="0.27 m/s times their area",
-        above=0.0,
-        high=50.0,
-        remark="240 mL/min are 4 mL/s",
     )
     """Mean flow rate through all inlets together; None: 0.27 m/s times the area of each inlet."""
     blood: Blood = Blood()
@@ -177,11 +159,7 @@ class FlowSettings:
     )
     """Inflow waveform; None: steady inflow at the mean."""
     outlets: Outlets = setting(
-        "zero_pressure",
-        "outlets",
-        "zero pressure at the outlets, or flow split by Murray's law: by diameter cubed",
-        str,
-        choices=get_args(Outlets),
+        "zero_pressure", "outlets", "zero pressure, or Murray's law: by diameter cubed", str, choices=get_args(Outlets)
     )
     """Zero pressure at every outlet, or outflow in proportion to radius cubed (Murray 1926, PNAS 12, 207)."""
     numerics: Numerics = Numerics()

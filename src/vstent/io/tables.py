@@ -105,23 +105,10 @@ def _plain(value: Any) -> Any:
     return f"{value:.{SIGNIFICANT_DIGITS}g}" if isinstance(value, float) else value
 
 
-def finite(word: str) -> float:
-    """Return a finite number read from text.
-
-    Raises
-    ------
-    ValueError
-        The text is not a finite number.
-    """
-    value = float(word)
-    if not math.isfinite(value):
-        raise ValueError("a finite number is needed")
-    return value
-
-
 def _number(word: str) -> float | None:
     """Return a finite number read from text, or None."""
     try:
-        return finite(word)
+        value = float(word)
     except ValueError:
         return None
+    return value if math.isfinite(value) else None

@@ -4,68 +4,51 @@ This module imports no numpy, so that command-line options and settings of a stu
 """
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
-from vstent.fields import check_all, setting, whole
+from vstent.fields import Limits, check_all, setting, whole
 
 if TYPE_CHECKING:
     from vstent.devices.design import Design, Range
     from vstent.geometry.vessel import Anatomy
     from vstent.kernels.arrays import Floats
 
+TO_EITHER_SIDE: Final = Limits("mm", 0.0)
+"""Limits of a range, which goes to either side."""
+
 
 @dataclass(frozen=True)
 class Ranges:
-    """Range of each cause and number of samples. The default ranges are vstent's own."""
+    """Range of each cause to either side, and number of samples. The default ranges are vstent's own."""
 
     samples: int = setting(
-        32,
-        "uncertainty",
-        "deploy N times with uncertain inputs varied",
-        whole,
-        metavar="N",
-        usual="off",
-        low=2,
-        high=4096,
+        32, "uncertainty", "deploy N times with uncertain inputs varied", whole, Limits(low=2, high=4096), "off"
     )
     """Number of deployments, rounded up to a power of two."""
     flow_samples: int = setting(
-        0, "uncertainty-flows", "also compute the flows of M of these deployments", whole, metavar="M", low=0
+        0, "uncertainty-flows", "also compute the flows of N of these deployments", whole, Limits(low=0)
     )
     """Number of deployments whose flow is computed without and with the device; each takes as long as a study."""
     threshold_mm: float | None = setting(
-        None,
-        "vary-threshold",
-        "range of all diameters to either side, for that of the threshold",
-        unit="mm",
-        low=0.0,
-        usual="the scan's own",
+        None, "vary-threshold", "range of all diameters, to either side", limits=TO_EITHER_SIDE, usual="the scan's own"
     )
     """Range of all diameters, in mm; None uses `threshold_band_mm` of the vessel, 0 for a surface."""
-    landing_mm: float = setting(1.0, "vary-landing", "range of the landing position to either side", unit="mm", low=0.0)
-    """Range of the landing position along the axis, in mm."""
-    device_mm: float = setting(
-        0.1, "vary-device", "range of the free diameter as made, to either side", unit="mm", low=0.0
+    landing_mm: float = setting(
+        1.0, "vary-landing", "range of the landing point, to either side", limits=TO_EITHER_SIDE
     )
+    device_mm: float = setting(0.1, "vary-device", "range of the free diameter, to either side", limits=TO_EITHER_SIDE)
     """Range of the free diameter as made, in mm; the number of pieces of wire stays the same."""
     inflow_fraction: float = setting(
-        0.2,
-        "vary-inflow",
-        "range of the mean inflow to either side, as a fraction of it",
-        metavar="FRACTION",
-        low=0.0,
-        high=0.99,
+        0.2, "vary-inflow", "range of the mean inflow, relative", limits=Limits(low=0.0, high=0.99), metavar="FRACTION"
     )
-    """Range of the mean inflow, relative."""
     numbers_factor: float = setting(
         1.0,
         "vary-numbers",
-        "factor of the ranges of the device's numbers in the catalogue; 0 leaves them out",
+        "factor of the ranges of the device's numbers",
+        limits=Limits(low=0.0, high=1.0),
         metavar="FACTOR",
-        low=0.0,
-        high=1.0,
     )
-    """Factor, 0 to 1, of the ranges of the device's numbers in the catalogue; 0 leaves them out."""
+    """Factor of the ranges of the device's numbers in the catalogue; 0 leaves them out."""
 
     def __post_init__(self) -> None:
         check_all(self)

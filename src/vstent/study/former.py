@@ -110,6 +110,6 @@ def refuse_other_anatomy(out: Path, settings: Settings, former: Settings | None 
 
 def _same(out: Path, what: str, former: Any, given: Any) -> Any:
     """Return a setting that at least one of two runs states; raise InputError where both do and differ."""
-    if former is not None and given is not None and former != given and asdict(former) != asdict(given):
+    if former is not None and given is not None and former != given:
         raise InputError(f"{out} holds results with other {what}. Give another --out, or --replace to replace them.")
     return given if former is None else former

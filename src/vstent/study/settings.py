@@ -15,6 +15,7 @@ from vstent.errors import InputError
 from vstent.fields import (
     LENGTH,
     POSITION,
+    Limits,
     Option,
     box,
     flag,
@@ -35,8 +36,6 @@ Units = Literal["m", "cm", "mm"]
 """Length unit of a surface file."""
 Frame = Literal["lps", "ras"]
 """Coordinate frame."""
-PLACE: Final[dict[str, Any]] = {"metavar": "X,Y,Z", "is_place": True, **POSITION}
-"""What options that state a point have in common."""
 
 
 def _read_neck(path: str) -> tuple[Point, ...]:
@@ -51,99 +50,69 @@ class InputSettings:
     """How the input is read; None means that the value is found or proposed."""
 
     units: Units | None = setting(
-        None, "units", "length unit of a surface file", str, choices=get_args(Units), usual="derived from its size"
+        None, "units", "length unit of a surface file", str, usual="derived from its size", choices=get_args(Units)
     )
-    """Length unit of a surface file."""
     frame: Frame | None = setting(
         None,
         "frame",
         "frame of a surface file and of points",
         str,
+        usual="the file's, else lps",
         choices=get_args(Frame),
-        usual="as stated in the file, else lps",
     )
-    """Frame of a surface file and of the points given; None: as the file states, and LPS points."""
+    """Frame of a surface file; the settings themselves are in LPS."""
     acquisition: int | None = setting(
         None,
         "acquisition",
-        "acquisition of a DICOM series with several",
+        "acquisition, from 1, of a DICOM series with several",
         whole,
-        metavar="N",
-        low=1,
-        usual="the brightest",
+        Limits(low=1),
+        "the brightest",
     )
-    """Acquisition of a DICOM series that holds several, counted from 1."""
-    spacing_mm: Point | None = setting(
-        None, "spacing", "voxel spacing of a raw volume", spacing, metavar="S|X,Y,Z", **LENGTH
-    )
-    """Voxel spacing of a raw volume, in mm."""
+    spacing_mm: Point | None = setting(None, "spacing", "voxel spacing of a raw volume", spacing, LENGTH)
     shape: tuple[int, int, int] | None = setting(
-        None,
-        "shape",
-        "number of voxels of a raw volume, fastest axis first",
-        shape,
-        metavar="I,J,K",
-        low=1,
-        high=100_000,
+        None, "shape", "number of voxels of a raw volume, fastest axis first", shape, Limits(low=1, high=100_000)
     )
-    """Number of voxels of a raw volume."""
     crop_mm: tuple[Point, Point] | None = setting(
         None,
         "crop",
-        "opposite corners of the box along the image axes to which a scan is cropped",
+        "corners of the box along the image axes to which a scan is cropped",
         box,
-        usual="whole scan",
-        **PLACE | {"metavar": "X,Y,Z,X,Y,Z"},
+        POSITION,
+        "whole scan",
     )
-    """Opposite corners, LPS mm, of the box along the image axes to which a scan is cropped."""
     threshold: float | None = setting(
-        None,
-        "threshold",
-        "intensity at the lumen wall of a scan",
-        metavar="T",
-        usual="half way between tissue and lumen",
+        None, "threshold", "intensity at the lumen wall of a scan", usual="half way from tissue to lumen", metavar="T"
     )
-    """Intensity at the lumen wall of a scan."""
 
 
 @dataclass(frozen=True)
 class AnatomySettings:
-    """What of the anatomy is given; None means that it is found."""
+    """What of the anatomy is given, points in LPS mm; None means that it is found."""
 
-    at_mm: Point | None = setting(None, "at", "point in or near the aneurysm", point, usual="the largest sac", **PLACE)
-    """Point near the sac, LPS mm."""
+    at_mm: Point | None = setting(None, "at", "point in or near the aneurysm", point, POSITION, "the largest sac")
     inlet_mm: Point | tuple[Point, ...] | None = setting(
-        None,
-        "inlet",
-        "point near the inlet",
-        point,
-        usual="the widest opening",
-        separators=";",
-        counts=(1, 50),
-        **PLACE,
+        None, "inlet", "point near the inlet", point, POSITION, "the widest opening", separators=";", counts=(1, 50)
     )
     """Point near the inlet, or near each inlet; the parent artery begins at the first."""
-    outlet_mm: Point | None = setting(None, "outlet", "point near the outlet of the parent artery", point, **PLACE)
-    """Point near the outlet of the parent artery."""
+    outlet_mm: Point | None = setting(None, "outlet", "point near the outlet of the parent artery", point, POSITION)
     neck_mm: tuple[Point, ...] | None = setting(
         None,
         "neck",
         "neck drawn by hand: columns x, y, z of points along a closed curve",
         str,
+        POSITION,
+        metavar="CSV",
         load=_read_neck,
         is_file=True,
         counts=(3, 1000),
-        **PLACE | {"metavar": "CSV"},
     )
-    """Neck drawn by hand: a closed curve near the wall around the mouth of the sac."""
     upstream_mm: float | None = setting(
-        None, "upstream", "length of artery kept proximal to the sac", usual="35", **LENGTH
+        None, "upstream", "length of artery kept proximal to the middle of the sac", limits=LENGTH, usual="35"
     )
-    """Length of artery to keep proximal to the middle of the sac, in mm."""
     downstream_mm: float | None = setting(
-        None, "downstream", "length of vessel kept distal to the sac", usual="25", **LENGTH
+        None, "downstream", "length of vessel kept distal to the middle of the sac", limits=LENGTH, usual="25"
     )
-    """Length of vessel to keep distal to the middle of the sac, in mm."""
 
 
 @dataclass(frozen=True)
@@ -230,7 +199,8 @@ def _section(kind: Any, given: Mapping[str, Any]) -> Any:
             value = given[option.name]
             if option.load:
                 value = option.check(option.load(value))
-            values[one.name] = _from_ras(value) if option.is_place and given.get("frame") == "ras" else value
+            is_ras = option.limits is POSITION and given.get("frame") == "ras"
+            values[one.name] = _from_ras(value) if is_ras else value
         elif option is None and sections_of(one.type):
             values[one.name] = _section(sections_of(one.type)[0], given)
     return kind(**values)
