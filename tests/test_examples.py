@@ -71,7 +71,7 @@ def test_readme_says_the_number_of_a_run(
     monkeypatch.chdir(inputs)
     names, (line,) = play(HERE / "README.md", capsys)
     settings = vstent.Settings(treatments=(vstent.read_treatment("silk"),), flow=None)
-    studied = vstent.run(Path("3dra"), tmp_path, settings, lambda stage, fraction, detail: None)
+    studied = vstent.run("3dra", tmp_path, settings)
     anatomy, silk, change = (names[key] for key in ("anatomy", "silk", "change"))
     assert studied.metrics["vessel"] == vstent.morphology(anatomy)
     deployed = studied.metrics["treatments"]["silk"]["implants"]["silk"]

@@ -118,7 +118,7 @@ def test_an_openfoam_case_holds_one_treatment(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--layers", "-3"], "0 or more"),
+        (["--layers", "-3"], "give at least 0"),
         (["--engine", "nonsense"], "unrecognized"),
         (["--refine-sac"], "unrecognized"),
         (["--gpu"], "unrecognized"),

@@ -33,7 +33,7 @@ Study = Callable[Concatenate[Path, Path, Given], Found]
 """Function of an input, a case folder and further arguments."""
 
 
-def claiming(study: Study[Given, Found]) -> Study[Given, Found]:
+def claiming(study: Study[Given, Found]) -> Callable[Concatenate[Path | str, Path | str, Given], Found]:
     """Decorate a study so that it reserves its case folder (the second argument) while it runs.
 
     Raises
@@ -43,7 +43,7 @@ def claiming(study: Study[Given, Found]) -> Study[Given, Found]:
     """
 
     @wraps(study)
-    def alone(path: Path, out: Path, /, *args: Given.args, **given: Given.kwargs) -> Found:
+    def alone(path: Path | str, out: Path | str, /, *args: Given.args, **given: Given.kwargs) -> Found:
         with claimed(Path(out)):
             return study(Path(path), Path(out), *args, **given)
 

@@ -46,7 +46,7 @@ from vstent.study.stages import (
     refine,
     vary_all,
 )
-from vstent.study.store import Store
+from vstent.study.store import Store, silent
 from vstent.study.types import CaseResult, Computed
 
 Implants = Mapping[str, Mapping[str, Deployment]]
@@ -58,7 +58,7 @@ def run(
     path: Path,
     out: Path,
     settings: Settings,
-    progress: OnProgress,
+    progress: OnProgress = silent,
     *,
     replaces: bool = False,
 ) -> CaseResult:
