@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from vstent.flow.case import FlowField, Level
+from vstent.flow.cells import Cells
 from vstent.geometry.surface import Surface
 from vstent.kernels import sampling as lattice_sampling
 from vstent.kernels import voxels
@@ -15,7 +16,7 @@ from vstent.kernels.arrays import Bools, Floats, Ints
 CORNERS: Final = np.indices((2, 2, 2)).reshape(3, 8).T
 """Corners of a unit cube, in the order of `lattice_sampling.stencils`."""
 NO_WEIGHT: Final = 1e-6
-"""Weight of a cell in an interpolation below which the point counts as lying on the face away from that cell."""
+"""Weight in an interpolation below which a cell does not count: points at cell centres are rounded."""
 
 
 def is_blood(field: FlowField, points_mm: Floats) -> Bools:
@@ -64,7 +65,7 @@ def through_surface_mL_s(field: FlowField, points_mm: Floats, area_mm2: Floats) 
     """Return the flow rate (p,) through sample points (p, 3) with area vectors (p, 3) (see `read_through_mL_s`)."""
     result = np.zeros(len(points_mm))
     for level, chosen, places in _on_levels(field, points_mm):
-        result[chosen] = read_through_mL_s(level.index, level.velocity_m_s, places, area_mm2[chosen])
+        result[chosen] = read_through_mL_s(level, level.velocity_m_s, places, area_mm2[chosen])
     return result
 
 
@@ -124,7 +125,7 @@ def through_mL_s(velocity_m_s: Floats, area_mm2: Floats) -> Floats:
     return np.einsum("ij,ij->i", velocity_m_s, area_mm2)  # 1 m/s times 1 mm2 is 1 mL/s
 
 
-def read_through_mL_s(index: Ints, velocity_m_s: Floats, points: Floats, area_mm2: Floats) -> Floats:
+def read_through_mL_s(grid: Cells, velocity_m_s: Floats, places: Floats, area_mm2: Floats) -> Floats:
     """Return the flow rate (p,) through sample points, with the velocity interpolated from the cells.
 
     Cubic Lagrange interpolation from the surrounding 64 cells is used, because linear interpolation underestimates the
@@ -132,16 +133,16 @@ def read_through_mL_s(index: Ints, velocity_m_s: Floats, points: Floats, area_mm
 
     Parameters
     ----------
-    index : (i, j, k) int
-        Index of the cell at every grid point, -1 outside the blood.
+    grid : Cells
+        The cells.
     velocity_m_s : (n, 3) float
-        Velocity of the cells.
-    points : (p, 3) float
-        Sample points in grid units.
+        Their velocity.
+    places : (p, 3) float
+        Grid coordinates of the sample points.
     area_mm2 : (p, 3) float
         Area vectors of the sample points.
     """
-    return through_mL_s(lattice_sampling.interpolate_cubic(index, velocity_m_s, points), area_mm2)
+    return through_mL_s(lattice_sampling.interpolate_cubic(grid.index, velocity_m_s, places), area_mm2)
 
 
 def inflow_mL_s(through_mL_s: Floats) -> float:

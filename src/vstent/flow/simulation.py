@@ -292,7 +292,9 @@ class _Runs:
     ) -> FlowField:
         """Run an engine from a guess or a saved state; after divergence start again with the engine's calmer case."""
         engine = self.engine(size_mm, self.folder if name == "answer" else self.folder / name, outer)
-        guess, bookmark = cache(partial(_guessed, engine, case, guess)), self._bookmark(name)
+        guess, bookmark, checkpoint = cache(partial(_guessed, engine, case, guess)), None, self.checkpoint
+        if checkpoint is not None:
+            bookmark = Bookmark(checkpoint.load(name), lambda saved: checkpoint.save(name, saved))
         progress = None if part is None else self._part(*part)
 
         def attempt() -> FlowField:
@@ -309,13 +311,6 @@ class _Runs:
                     raise
                 case, bookmark = calmer, None if bookmark is None else replace(bookmark, saved=None)
         return attempt()
-
-    def _bookmark(self, name: str) -> Bookmark | None:
-        """Return the bookmark of a run by its name, or None without a checkpoint."""
-        checkpoint = self.checkpoint
-        if checkpoint is None:
-            return None
-        return Bookmark(checkpoint.load(name), lambda saved: checkpoint.save(name, saved))
 
     def _part(self, begin: float, end: float) -> OnProgress | None:
         """Return a progress callback for one run among several, from `begin` to `end` of the whole."""

@@ -7,7 +7,6 @@ fine grid, with velocity and pressure of the coarser flow at the cuts where the 
 it.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import pi, sqrt
@@ -164,7 +163,7 @@ def close_up(case: FlowCase, outer: FlowField) -> CloseUp:
     sac = sampling.cells_inside(require_sac(case), grid.centers_mm, grid.cell_size_mm)
     distance_mm = dijkstra(graph, directed=False, indices=sac, min_only=True)
     diameter_mm = domains.mean_diameter_mm(case.vessel)
-    ends = _cells_at_ends(grid, sections)
+    ends = np.asarray(cKDTree(grid.centers_mm).query([section.mean(axis=0) for section in sections])[1])
     whole_mm = np.full(len(distance_mm), np.inf)
     part = _parts(graph, distance_mm > DOWNSTREAM_DIAMETERS * diameter_mm, ends)
     near = CloseUp(outer, whole_mm, part, part[ends])
@@ -187,11 +186,6 @@ def volume_mm3(case: FlowCase) -> float:
     neck_mm2 = 0.0 if case.ostium is None else case.ostium.area_mm2
     stretch_mm = (UPSTREAM_DIAMETERS + DOWNSTREAM_DIAMETERS) * diameter_mm + sqrt(4 / pi * neck_mm2)
     return min(abs(sac.volume_mm3) + pi / 4 * diameter_mm**2 * stretch_mm, abs(case.vessel.closed.volume_mm3))
-
-
-def _cells_at_ends(outer: Level, sections: Sequence[Floats]) -> Ints:
-    """Return the coarse cell (k,) at the end of every opening's extension, given its end polygon."""
-    return np.asarray(cKDTree(outer.centers_mm).query([section.mean(axis=0) for section in sections])[1])
 
 
 def _parts(graph: csr_matrix, is_beyond: Bools, ends: Ints) -> Ints:
@@ -266,7 +260,10 @@ def assembled(chosen: CloseUp, inner: FlowField) -> FlowField:
     inner : FlowField
         Flow in the region.
     """
-    outer, is_fine = chosen.outer, _is_well_within(chosen, inner.wall)
+    outer, grid = chosen.outer, chosen.outer.finest
+    behind_mm = inner.wall.vertices_mm - 0.5 * grid.cell_size_mm * inner.wall.vertex_normals
+    # Vertices with fine cells all around.
+    is_fine = chosen.depth_mm[cKDTree(grid.centers_mm).query(behind_mm)[1]] > RIM_CELLS * grid.cell_size_mm
 
     def of_wall(fine: Floats, wide: Floats) -> Floats:
         return np.asarray(np.where(is_fine if fine.ndim == 1 else is_fine[:, None], fine, wide))
@@ -294,14 +291,6 @@ def assembled(chosen: CloseUp, inner: FlowField) -> FlowField:
         unsettled_fraction=max(inner.unsettled_fraction, outer.unsettled_fraction),
         advice=(
             f"{inner.advice} The grid spacing is {inner.finest.cell_size_mm:.3g} mm in and near the sac and "
-            f"{outer.finest.cell_size_mm:.3g} mm elsewhere; there: {outer.advice}"
+            f"{grid.cell_size_mm:.3g} mm elsewhere; there: {outer.advice}"
         ),
     )
-
-
-def _is_well_within(chosen: CloseUp, wall: Surface) -> Bools:
-    """Return whether each vertex (v,) of the wall has fine cells all around."""
-    outer = chosen.outer.finest
-    behind_mm = wall.vertices_mm - 0.5 * outer.cell_size_mm * wall.vertex_normals
-    nearest = cKDTree(outer.centers_mm).query(behind_mm)[1]
-    return np.asarray(chosen.depth_mm[nearest] > RIM_CELLS * outer.cell_size_mm)

@@ -364,6 +364,6 @@ def monitored(state: State, now: Snapshot) -> Floats:
     values = [speed_m_s[state.probe.cells].mean(), now.pressure_Pa[inlet].mean(), speed_m_s.mean()]
     if len(state.probe.ostium_points):
         at, area_mm2 = state.probe.ostium_points, state.probe.ostium_area_mm2
-        through_mL_s = sampling.read_through_mL_s(state.domain.index, velocity_m_s.astype(float), at, area_mm2)
+        through_mL_s = sampling.read_through_mL_s(state.domain, velocity_m_s.astype(float), at, area_mm2)
         values.append(sampling.inflow_mL_s(through_mL_s))
     return np.array(values, dtype=float)
