@@ -78,12 +78,18 @@ def wait(client: Client, case: str) -> None:
         time.sleep(0.25)
 
 
-def drag(client: Client, case: str, device: dict[str, Any], count: int) -> tuple[list[float], list[int]]:
+def alone(device: str, **given: Any) -> dict[str, Any]:
+    """Return what is asked of a treatment of one device."""
+    treatment = {"name": device, "implants": [{"id": device, "device": device, **given}]}
+    return {"treatment": treatment, "implant": device}
+
+
+def drag(client: Client, case: str, device: str, count: int) -> tuple[list[float], list[int]]:
     """Slide the device to and fro; return seconds and bytes of every redraw."""
     seconds, sizes = [], []
-    middle = manifest(client.ask("POST", f"{case}/sketch", {"device": device}))["center_mm"]
+    middle = center_mm(client, case, alone(device))
     for i in range(count):
-        wanted = {"device": device, "abscissa_mm": middle + 1.5 * (i % 20 - 10) / 10}
+        wanted = {**alone(device), "abscissa_mm": middle + 1.5 * (i % 20 - 10) / 10}
         began = time.perf_counter()
         message = client.ask("POST", f"{case}/sketch", wanted)
         seconds.append(time.perf_counter() - began)
@@ -96,18 +102,15 @@ def let_go(client: Client, case: str, name: str, count: int) -> list[float]:
     seconds = []
     for i in range(count):
         view = client.get(case)
-        devices = [
-            {**device, "center_mm": client_center(client, case, device) + (0.1 if i % 8 < 4 else -0.13)}
-            if device["name"] == name
-            else device
-            for device in view["choices"]["devices"]
-        ]
+        before = next(one for one in view["choices"]["treatments"] if one["name"] == name)
+        now_mm = center_mm(client, case, {"treatment": before, "implant": name})
+        chosen = alone(name, placing={"position_mm": now_mm + (0.1 if i % 8 < 4 else -0.13)})
+        treatments = [chosen["treatment"] if one is before else one for one in view["choices"]["treatments"]]
         began = time.perf_counter()
-        change = {"revision": view["revision"], "choices": {**view["choices"], "devices": devices}}
+        change = {"revision": view["revision"], "choices": {**view["choices"], "treatments": treatments}}
         client.ask("PUT", f"{case}/choices", change)
-        chosen = next(device for device in devices if device["name"] == name)
-        found = manifest(client.ask("POST", f"{case}/deployment", {"device": chosen}))
-        assert found["measures"]["rows"]
+        found = manifest(client.ask("POST", f"{case}/deployment", chosen))
+        assert found["measures"][0]["rows"]
         seconds.append(time.perf_counter() - began)
     return seconds
 
@@ -124,8 +127,8 @@ def pull(client: Client, case: str, count: int) -> list[float]:
     return seconds
 
 
-def client_center(client: Client, case: str, device: dict[str, Any]) -> float:
-    return float(manifest(client.ask("POST", f"{case}/sketch", {"device": device}))["center_mm"])
+def center_mm(client: Client, case: str, wanted: dict[str, Any]) -> float:
+    return float(manifest(client.ask("POST", f"{case}/sketch", wanted))["center_mm"])
 
 
 def processor_s(pid: int) -> float:
@@ -166,10 +169,9 @@ def main() -> None:
             client.ask("POST", f"{case}/jobs/rank")
             wait(client, case)
             spent("from the file to the ranked list", began, processor_s(server.pid))
-            device = {"name": arguments.device}
-            drag(client, case, device, 3)  # the wall is measured once, kernels are loaded
+            drag(client, case, arguments.device, 3)  # the wall is measured once, kernels are loaded
             used = processor_s(server.pid)
-            seconds, sizes = drag(client, case, device, arguments.sketches)
+            seconds, sizes = drag(client, case, arguments.device, arguments.sketches)
             said(f"a redraw of {arguments.device} while dragged", seconds, processor_s(server.pid) - used)
             let_go(client, case, arguments.device, 1)
             used = processor_s(server.pid)
@@ -178,7 +180,8 @@ def main() -> None:
             used = processor_s(server.pid)
             seconds = pull(client, case, arguments.sketches)
             said("a point of the neck while pulled", seconds, processor_s(server.pid) - used)
-            scene = [client.ask("GET", f"{case}/anatomy"), client.ask("POST", f"{case}/deployment", {"device": device})]
+            deployed = client.ask("POST", f"{case}/deployment", alone(arguments.device))
+            scene = [client.ask("GET", f"{case}/anatomy"), deployed]
             page = sum(len(client.ask("GET", f"/assets/{file}")) for file in FILES)
             print(f"{'a redraw':44} {statistics.median(sizes) / 1e6:6.2f} MB")
             print(f"{'page, anatomy and a deployed device':44} {(page + sum(map(len, scene))) / 1e6:6.2f} MB")

@@ -23,10 +23,11 @@ from vstent.cli import main
 from vstent.cohort.batch import collect, left_to_do, run_cohort
 from vstent.cohort.cases import Case, find_cases
 from vstent.cohort.work import COST, Row
+from vstent.devices.treatment import with_device
 from vstent.io.writers import write_stl
 from vstent.phantoms import Phantom
 from vstent.study.crews import DaskCluster
-from vstent.study.settings import Settings
+from vstent.study.settings import InputSettings, Settings
 
 SEED = 7
 EDGE_MM = 0.3
@@ -71,7 +72,7 @@ def cohort(count: int, jobs: int) -> None:
     devices = [word for device in DEVICES for word in ("--device", device)]
     given = [str(folder / f"scans-{count}"), "--out", str(out), "--no-flow", "--units", "mm", "--jobs", str(jobs)]
     main(["batch", *given, *devices])
-    settings = Settings(devices=DEVICES, flow=None, units="mm")
+    settings = Settings(InputSettings(units="mm"), treatments=tuple(map(with_device, DEVICES)), flow=None)
     cases = find_cases(folder / f"scans-{count}", settings)
     rows = collect(cases, out)
     print("| cases | by | rows done | rows failed | wall, s | CPU s a case | most | memory, MB |")
@@ -83,7 +84,7 @@ def cohort(count: int, jobs: int) -> None:
         print("The two tables are", "the same." if bare(other) == bare(rows) else "NOT the same.")
     for row in rows:
         if row["outcome"] != "done":
-            print(f"{row['case']} {row['device']} {row['outcome']} {row['stage']}: {row['sentence']}")
+            print(f"{row['case']} {row['treatment']} {row['outcome']} {row['stage']}: {row['sentence']}")
 
 
 def tell(by: str, rows: Sequence[Row], wall_s: float) -> None:

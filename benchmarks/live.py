@@ -97,7 +97,7 @@ def numbers(preview: Preview) -> dict:
 
 def switched(preview: Preview, stent: Stent) -> tuple[float, float, float]:
     """Return the seconds from the switch to the first number with a band, the number, and its band in points."""
-    preview.place(stent)
+    preview.place((stent,))
     began = perf_counter()
     while perf_counter() - began < LONGEST_S:
         told = numbers(preview)

@@ -21,7 +21,7 @@ def main(case: Path) -> None:
     """Go on with the demo in a case folder, and draw it."""
     record = read_record(case / RUN)
     result = study.run(record.input, record.folder, record.settings, Console().progress)
-    PICTURE.write_bytes(overview(scene_of(result)))
+    PICTURE.write_bytes(overview(scene_of(result.anatomy, result.implants, result.fields)))
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ CARRIED = (
     "vstent/reporting/assets/LICENSES.txt",
 )
 """Files without which an installed vstent does not work, or may not be handed on."""
-RESULTS = ("report.html", "metrics.json", "run.json", "stents/silk/wires.vtp")
+RESULTS = ("report.html", "metrics.json", "run.json", "treatments/silk/implants/silk/wires.vtp")
 """Files that the demo leaves."""
 
 
