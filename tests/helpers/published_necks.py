@@ -16,7 +16,7 @@ from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
 from vstent.errors import VstentError
 from vstent.geometry.surface import Surface
-from vstent.geometry.vessel import Anatomy
+from vstent.geometry.vessel import Anatomy, Aneurysm
 from vstent.kernels import sections, triangles
 
 N_SAMPLES = 30_000
@@ -131,16 +131,19 @@ def _beside(patient: Patient, anatomy: Anatomy, true: Surface, area_mm2: float) 
         tuple(measures[name] / area_mm2 for name in names),
         tuple(float(np.arccos(min(abs(cosine), 1.0))) for cosine in cosines),
         tuple(float(np.linalg.norm(at - patient.center_mm)) / np.sqrt(4 * area_mm2 / np.pi) for at in centers),
-        _overlaps(sac.sac, sac.plane, true),
+        _overlaps(sac, true),
     )
 
 
-def _overlaps(sac: Surface, plane, true: Surface) -> tuple[float, float]:
+def _overlaps(aneurysm: Aneurysm, true: Surface) -> tuple[float, ...]:
+    sac, plane = aneurysm.sac, aneurysm.plane
     both = np.concatenate([sac.vertices_mm, true.vertices_mm])
     low, high = both.min(axis=0), both.max(axis=0)
     step = np.cbrt(np.prod(high - low) / N_SAMPLES)
     axes = [np.arange(a + 0.5 * step, b, step) for a, b in zip(low, high, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     ours, theirs = sac.signed_distance(points) < 0, true.signed_distance(points) < 0
-    beyond = ours & ((points - plane.center_mm) @ plane.normal > 0)
+    # A sac closed by its plane is beyond it, pouches included.
+    is_flat = np.abs((aneurysm.neck_mm - plane.center_mm) @ plane.normal).max() < 1e-6
+    beyond = ours & (is_flat | ((points - plane.center_mm) @ plane.normal > 0))
     return tuple(float((one & theirs).sum() / (one | theirs).sum()) for one in (ours, beyond))

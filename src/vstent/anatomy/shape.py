@@ -12,7 +12,7 @@ from vstent.kernels.arrays import Floats
 ON_NECK_MM: Final = 1e-4
 """Distance from the neck, in mm, below which a face of the sac belongs to it: both have the same triangles."""
 ON_PLANE_MM: Final = 1e-6
-"""A neck whose rim is within this distance of a plane, in mm, lies in it: the whole sac is beyond."""
+"""A neck within this distance of a plane, in mm, lies in it: the whole sac is beyond."""
 ON_PLANE: Final = 1e-6
 """Largest deviation from 1 of the cosine between the neck plane's normal and that of a facet on the plane."""
 HALF_SPHERE: Final = float(np.cbrt(18 * np.pi))
@@ -42,7 +42,7 @@ def beyond_plane(aneurysm: Aneurysm, center_mm: Floats, normal: Floats) -> Beyon
     normal : (3,) unit normal, toward the dome.
     """
     sac = aneurysm.sac
-    if np.abs((aneurysm.neck_mm - center_mm) @ normal).max() < ON_PLANE_MM:
+    if np.abs((aneurysm.neck.corners_mm - center_mm) @ normal).max() < ON_PLANE_MM:
         neck_mm2 = aneurysm.neck.area_mm2
         return Beyond(neck_mm2, sac.volume_mm3, sac.area_mm2 - neck_mm2, sac.vertices_mm)
     below_mm = -(sac.vertices_mm - center_mm) @ normal
