@@ -117,7 +117,7 @@ def test_a_flow_that_has_settled_is_its_last_check() -> None:
     engine, state, seen = unsettled(11)
     state.history = [state.history[-1]] * 12
     for excess in (0.1, 0.0):
-        wanted = (1 + excess) * state.links.wanted[0] * state.links.openings[0, 7]
+        wanted = (1 + excess) * state.links.wanted[0] * state.links.openings[0, d3q19.AREA]
         last = replace(state.snapshots[-1], outflow=wanted * np.array([-1.0, 1.0]))
         state.snapshots.extend([last] * 7)
         assert engine.terminate(state) == pytest.approx(3 * excess)

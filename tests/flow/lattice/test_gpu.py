@@ -143,10 +143,11 @@ def everything() -> lattice_state.State:
     state = PulsatileLatticeBoltzmann(CELL_MM).init(case, None)
     links, a = state.links, state.addressing
     openings = links.openings[[0, 1, 1]]
-    openings[2, :2], openings[1:, 7] = (d3q19.OUTFLOW, -0.5 * openings[0, 1]), 0.5 * openings[1, 7]
+    openings[2, [d3q19.KIND, d3q19.WANTED]] = d3q19.OUTFLOW, -0.5 * openings[0, d3q19.WANTED]
+    openings[1:, d3q19.AREA] *= 0.5
     start = np.array([*links.start[:2], links.start[1:].mean(), links.start[2]], np.int32)
     swing = np.array([1.0, 0.8, 1.2])  # what a close-up imposes in the course of a cycle
-    wanted = openings[:, 1].copy()
+    wanted = openings[:, d3q19.WANTED].copy()
     course = 0.1 * swing[:, None] * np.abs(wanted).max() * [1.0, 0.0, 1.0]
     shape = swing[:, None, None] * links.shape
     state.links = replace(links, openings=openings, start=start, wanted=wanted, course=course, shape=shape)

@@ -244,6 +244,12 @@ def test_a_device_is_meshed_by_its_wires_over_an_ostium_or_refused() -> None:
     assert solids is not None
     assert 0 < solids.volume_mm3 < 0.3 * struts(stent).volume_mm3
     assert strut_solids(flow_case(branched, ())) is None
+    both = flow_case(branched, (stent, stent))
+    assert len(both.media) == len(both.solids) == 2
+    two = strut_solids(both)
+    assert two is not None
+    assert two.volume_mm3 == pytest.approx(2 * solids.volume_mm3)
+    assert tell_cost(both, 0.2) != tell_cost(flow_case(branched, (stent,)), 0.2)
     with pytest.raises(LandingError, match="over a neck or a branch's ostium"):
         strut_solids(flow_case(healthy, (stent,)))
     with pytest.raises(FlowError, match="give the stent itself"):

@@ -56,7 +56,7 @@ class Ends:
 
         Returns
         -------
-        openings : (k, 9)
+        openings : (k, d3q19.OPENING)
             Rows for `d3q19.drive`.
         wanted : (k,)
             Speed to impose at mean flow, in lattice units.
@@ -66,29 +66,29 @@ class Ends:
             Profile coefficients of all links at these moments (see `d3q19.drive`).
         """
         usual, shape = self._at(self.close_up, patches, links)
-        wanted = usual[:, 1].copy()
+        wanted = usual[:, d3q19.WANTED].copy()
         phases = () if self.close_up is None else self.close_up.outer.phases
         if not phases:
             return usual, wanted, np.zeros((1, len(patches))), shape[None]
         moments = [self._at(self._outside.at_phase(phase), patches, links) for phase in phases]
         factor = self.case.inflow_factor(np.array([phase.time_s for phase in phases]))
-        course = np.stack([rows[:, 1] for rows, _ in moments]) - factor[:, None] * wanted
+        course = np.stack([rows[:, d3q19.WANTED] for rows, _ in moments]) - factor[:, None] * wanted
         return usual, wanted, course, np.stack([shape for _, shape in moments])
 
     def _at(self, now: CloseUp | None, patches: Ints, links: Sequence[Ints]) -> tuple[Floats, Floats]:
-        """Return rows (k, 9) for `d3q19.drive` and profile coefficients (l, 2) of all links at one moment."""
+        """Return rows for `d3q19.drive` and profile coefficients (l, 2) of all links at one moment."""
         ends = [self._end(now, int(patch), of_end) for patch, of_end in zip(patches, links, strict=True)]
         return np.stack([row for row, _ in ends]), np.concatenate([shape for _, shape in ends])
 
     def _end(self, now: CloseUp | None, patch: int, links: Ints) -> tuple[Floats, Floats]:
-        """Return the row (9,) and profile coefficients (l, 2) of one end, which is an opening or a cut."""
+        """Return the row and profile coefficients (l, 2) of one end, which is an opening or a cut."""
         part = patch - 1 - len(self.case.vessel.openings)
         if now is None or part < 0:
             return self._opening(patch - 1, links)
         return self._entry(now, part, links) if self._outside.inflow_mL_s[part] > 0 else self._exit(now, part, links)
 
     def _opening(self, k: int, links: Ints) -> tuple[Floats, Floats]:
-        """Return the row (9,) and profile coefficients (l, 2) of opening `k`."""
+        """Return the row and profile coefficients (l, 2) of opening `k`."""
         opening, end = self.case.vessel.openings[k], self.case.ends[k]
         area = opening.area_mm2 / self.domain.cell_size_mm**2
         shape = np.zeros((len(links), 2))
@@ -103,8 +103,14 @@ class Ends:
             case _:
                 assert_never(end)
         speed = mean_mL_s / opening.area_mm2 / self.scales.speed_m_s
-        row = np.array([kind, speed, 0.0, self._rate(kind), *opening.normal, area, 0.0])
-        return row, shape
+        return self._row(kind, speed, opening.normal, area), shape
+
+    def _row(self, kind: float, speed: float, normal: Floats, area: float) -> Floats:
+        """Return the row (`d3q19.OPENING`,) of an end: its condition, mean speed, outward normal and area in cells."""
+        row = np.zeros(d3q19.OPENING)
+        row[[d3q19.KIND, d3q19.WANTED, d3q19.RATE, d3q19.AREA]] = kind, speed, self._rate(kind), area
+        row[d3q19.NORMAL : d3q19.NORMAL + 3] = normal
+        return row
 
     def _developed(self, k: int, links: Ints, area: float) -> Floats:
         """Return the profile coefficients (l, 2) of the links of inlet `k` for fully developed flow."""
@@ -135,7 +141,7 @@ class Ends:
         mean = shown.inflow_mL_s[part] / self.scales.flow_mL_s / area
         profile = (self._velocity(shown, links, way) / mean for way in (0.0, 0.5, 1.0))
         speed = now.inflow_mL_s[part] / self.scales.flow_mL_s / area
-        row = np.array([d3q19.INFLOW, speed, 0.0, self._rate(d3q19.INFLOW), *normal, area, 0.0])
+        row = self._row(d3q19.INFLOW, speed, normal, area)
         return row, _sent(self.domain.link_direction[links], normal, area, *profile)
 
     def _exit(self, now: CloseUp, part: int, links: Ints) -> tuple[Floats, Floats]:
@@ -152,7 +158,7 @@ class Ends:
         density += 1.5 * inward**2  # `d3q19.outlet_source` subtracts this term again
         kind = d3q19.PRESSURE if self._takes_the_rest(part) else d3q19.OUTFLOW
         speed = -now.inflow_mL_s[part] / self.scales.flow_mL_s / area
-        row = np.array([kind, speed if kind == d3q19.OUTFLOW else 0.0, 0.0, self._rate(kind), *normal, area, 0.0])
+        row = self._row(kind, speed if kind == d3q19.OUTFLOW else 0.0, normal, area)
         return row, np.stack([density, np.zeros(len(links))], axis=1)
 
     @property

@@ -162,9 +162,9 @@ def _left(state: State) -> float:
 
 def _inflow_error(state: State) -> float:
     """Return the relative error of the inflow, which is not zero while sound waves leave through the openings."""
-    openings = state.links.openings
-    enters = openings[:, 0] == d3q19.INFLOW
-    wanted = (state.links.wanted * openings[:, 7])[enters]
+    links = state.links
+    enters = links.is_inflow
+    wanted = (links.wanted * links.openings[:, d3q19.AREA])[enters]
     return float(np.abs(state.snapshots[-1].outflow[enters] + wanted).sum() / wanted.sum())
 
 

@@ -38,7 +38,7 @@ class Numbers:
     correction: NDArray[np.float32]
     """(5, w) `Links.correction` of the walls."""
     openings: Floats
-    """(k, 9) `Links.openings`."""
+    """(k, d3q19.OPENING) `Links.openings`."""
     start: Ints
     """(k + 1,) `Links.start`."""
 

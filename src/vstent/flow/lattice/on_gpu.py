@@ -250,7 +250,7 @@ class Device:
 
     def _openings(self) -> Floats:
         """Return `Links.openings` as they are on the GPU."""
-        return np.asarray(self._doubles[self._at.opening].copy_to_host()).reshape(-1, kernels.OPENING)
+        return np.asarray(self._doubles[self._at.opening].copy_to_host()).reshape(-1, d3q19.OPENING)
 
 
 def _arrays(arguments: Sequence[Any]) -> Iterator[Any]:
@@ -292,7 +292,7 @@ def seconds_of_update(place: Ints, length: Ints, stride: int, relaxation: Sequen
         nothing,
         np.zeros((0, d3q19.ENTRY), np.float32),
         np.zeros((5, 0), np.float32),
-        np.zeros((0, kernels.OPENING)),
+        np.zeros((0, d3q19.OPENING)),
         np.zeros(1, np.int32),
     )
     at = tables(packed, numbers)

@@ -140,7 +140,7 @@ class Links:
     source: NDArray[np.float32]
     """(l,) source term of every link."""
     openings: Floats
-    """(k, 9) condition and state of every end (see `d3q19.drive`)."""
+    """(k, d3q19.OPENING) condition and state of every end (see `d3q19.drive`)."""
     start: Ints
     """(k + 1,) first link of every end, and of the wall."""
     by_layer: Ints
@@ -156,9 +156,14 @@ class Links:
     shape: Floats
     """(m, o, 2) profile coefficients at the same times (see `d3q19.drive`)."""
 
+    @property
+    def is_inflow(self) -> Bools:
+        """Whether blood is sent in through each end (k,)."""
+        return np.asarray(self.openings[:, d3q19.KIND] == d3q19.INFLOW)
+
     def stretched(self, stretch: float) -> "Links":
         """Return the same links for time steps `stretch` times as long; arrays that change in place are shared."""
-        is_inflow = np.repeat(self.openings[:, 0] == d3q19.INFLOW, np.diff(self.start))
+        is_inflow = np.repeat(self.is_inflow, np.diff(self.start))
         return replace(
             self,
             correction=self.correction - np.outer(np.float32(stretch - 1) * self.viscous, CURVE),
@@ -316,7 +321,7 @@ def build_links(case: FlowCase, grid: Grid, scales: Scales, close_up: CloseUp | 
     opening_links = order[: start[-1]]
     ends = Ends(case, domain, scales, close_up)
     openings, wanted, course, shape = ends.imposed(patches, np.split(opening_links, start[1:-1]))
-    weight[: start[-1]][np.repeat(openings[:, 0] == d3q19.INFLOW, np.diff(start))] = (1.0, 0.0, 0.0)
+    weight[: start[-1]][np.repeat(openings[:, d3q19.KIND] == d3q19.INFLOW, np.diff(start))] = (1.0, 0.0, 0.0)
     return Links(
         patches,
         addressing.link_address[order],

@@ -73,22 +73,22 @@ def build(
     links = build_links(case, grid, scales, close_up)
     screen = build_screen(case, domain, addressing, scales)
     state = State(
-        case,
-        close_up,
-        domain,
-        addressing,
-        scales,
-        (links, screen),
-        links,
-        screen,
-        _probe(case, domain),
-        build_refill(grid),
-        grid.bands,
-        grid.limit[addressing.first_cell],
-        np.zeros(19 * addressing.stride + lanes.COUNT, dtype=np.float32),
-        pace,
-        check_s,
-        deque(maxlen=kept),
+        case=case,
+        close_up=close_up,
+        domain=domain,
+        addressing=addressing,
+        scales=scales,
+        built=(links, screen),
+        links=links,
+        screen=screen,
+        probe=_probe(case, domain),
+        refill=build_refill(grid),
+        bands=grid.bands,
+        limit=grid.limit[addressing.first_cell],
+        populations=np.zeros(19 * addressing.stride + lanes.COUNT, dtype=np.float32),
+        pace=pace,
+        check_s=check_s,
+        snapshots=deque(maxlen=kept),
     )
     if start is not None:
         _begin_from(state, start)
@@ -147,9 +147,10 @@ def _begin_from(state: State, start: FlowField) -> None:
         velocity / state.scales.speed_m_s,
     )
     links = state.links
-    for k in np.flatnonzero(links.openings[:, 0] == d3q19.INFLOW):
+    for k in np.flatnonzero(links.is_inflow):
         at_inlet = links.place[links.start[k] : links.start[k + 1]]
-        links.openings[k, 2] = d3q19.moments(state.populations, state.addressing.stride, at_inlet)[:, 0].mean()
+        moments = d3q19.moments(state.populations, state.addressing.stride, at_inlet)
+        links.openings[k, d3q19.MEMORY] = moments[:, 0].mean()
 
 
 def exchange(state: State, case: FlowCase) -> None:
@@ -309,7 +310,7 @@ def _advance_here(state: State, wanted: Floats, moments: Floats, first_pair: int
     of_openings = links.start, links.address, links.place, links.direction, links.shape
     opening_source = links.source[: links.start[-1]]
     for pair in range(len(wanted)):
-        links.openings[:, 1] = wanted[pair]
+        links.openings[:, d3q19.WANTED] = wanted[pair]
         d3q19.drive(f, a.stride, links.openings, of_openings, moments[pair], opening_source)
         d3q19.update(f, cells, back, state.bands, shares)
         if (first_pair + pair) % DEFER_PAIRS == 0:
@@ -359,7 +360,7 @@ def monitored(state: State, now: Snapshot) -> Floats:
     """Return the monitored quantities: mean speed in the sac, inlet pressure, mean speed in the vessel, neck inflow."""
     velocity_m_s = now.velocity_m_s
     speed_m_s = speeds(velocity_m_s)
-    first_inflow = state.links.patch[np.argmax(state.links.openings[:, 0] == d3q19.INFLOW)]
+    first_inflow = state.links.patch[np.argmax(state.links.is_inflow)]
     inlet = state.domain.link_cell[state.domain.link_patch == first_inflow]
     values = [speed_m_s[state.probe.cells].mean(), now.pressure_Pa[inlet].mean(), speed_m_s.mean()]
     if len(state.probe.ostium_points):

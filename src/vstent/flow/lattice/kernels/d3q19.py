@@ -48,8 +48,13 @@ AXIAL: Final = 6
 """Number of the last direction along an axis; those after it are diagonal."""
 PRESSURE, INFLOW, OUTFLOW = 0.0, 1.0, 2.0
 """Boundary conditions of an opening (see `drive`)."""
-OWN_DENSITIES: Final = (2, 8)
-"""Columns of an opening's row that hold densities which it updates itself (see `drive`)."""
+KIND, WANTED, MEMORY, RATE, NORMAL, AREA, DENSITY = 0, 1, 2, 3, 4, 7, 8
+"""Columns of an opening: its condition, the density deviation or speed imposed, the remembered mean density and its
+rate of change, the first of three of the outward normal, the area in cell faces, and the present density."""
+OPENING: Final = 9
+"""Number of columns of an opening."""
+OWN_DENSITIES: Final = (MEMORY, DENSITY)
+"""Columns that hold densities which an opening updates itself."""
 SLOWLY: Final = 0.1
 """Under-relaxation factor of an outlet's density per step pair. Without it the density would react to its own
 effect."""
@@ -555,47 +560,38 @@ def resisted(velocity: Any, entries: Any, times: Any, odd_rate: float) -> Any:
 
 
 @njit(cache=True, forceinline=True)
-def inflow_speed(opening: Any, density: float) -> float:
-    """Return the speed of an inflow whose mean density is given, so that sound can leave.
+def answered(opening: Any, measured: float) -> float:
+    """Return the speed of an inflow, or the density deviation of an outlet, during the next two steps (see `drive`).
+
+    It depends on the opening's condition only here.
 
     Parameters
     ----------
-    opening : (9,)
-        As in `drive`; its remembered density changes in place.
-    density : float
-        Mean density deviation at the opening.
+    opening : (`OPENING`,)
+        As in `drive`; its own densities change in place.
+    measured : float
+        Mean density deviation at an inflow; flow rate out of any other opening, in cells per time step.
     """
-    # With a high resistance downstream the flow would rise only as fast as the mean density follows: update faster.
-    resistance = abs(density) / max(abs(opening[1]), 1e-6)
-    rate = min(1.0, opening[3] * (1.0 + resistance / _ROOT_THREE))
-    opening[2] += rate * (density - opening[2])
-    speed: float = opening[1] - (density - opening[2]) / _ROOT_THREE
-    return speed
-
-
-@njit(cache=True, forceinline=True)
-def outlet_density(opening: Any, flow: float) -> float:
-    """Return the density deviation that an outlet imposes at a given flow rate.
-
-    Parameters
-    ----------
-    opening : (9,)
-        As in `drive`; its remembered and present density change in place.
-    flow : float
-        Flow rate out, in cells per time step.
-    """
-    excess = flow / opening[7] - opening[1]
-    opening[2] += opening[3] * excess
-    opening[8] += SLOWLY * (opening[2] + _ROOT_THREE * excess - opening[8])
-    density: float = opening[8]
-    return density
+    answer: float = opening[WANTED]
+    if opening[KIND] == INFLOW:
+        # With a high resistance downstream the flow would rise only as fast as the mean density follows: update faster.
+        resistance = abs(measured) / max(abs(opening[WANTED]), 1e-6)
+        rate = min(1.0, opening[RATE] * (1.0 + resistance / _ROOT_THREE))
+        opening[MEMORY] += rate * (measured - opening[MEMORY])
+        answer = opening[WANTED] - (measured - opening[MEMORY]) / _ROOT_THREE
+    elif opening[KIND] == OUTFLOW:
+        excess = measured / opening[AREA] - opening[WANTED]
+        opening[MEMORY] += opening[RATE] * excess
+        opening[DENSITY] += SLOWLY * (opening[MEMORY] + _ROOT_THREE * excess - opening[DENSITY])
+        answer = opening[DENSITY]
+    return answer
 
 
 @njit(cache=True, forceinline=True)
 def outlet_source(velocity: Any, q: int, opening: Any, density: float) -> float:
     """Return what an outlet of this density deviation sends along direction `q` into a cell with this velocity (3)."""
     ux, uy, uz = velocity
-    inward = max(0.0, -(ux * opening[4] + uy * opening[5] + uz * opening[6]))
+    inward = max(0.0, -(ux * opening[NORMAL] + uy * opening[NORMAL + 1] + uz * opening[NORMAL + 2]))
     return 2.0 * WEIGHTS[q] * even_part(q, density - 1.5 * inward * inward, ux, uy, uz)
 
 
@@ -659,9 +655,8 @@ def drive(f: Any, stride: int, openings: Any, links: Any, moment: Any, source: A
         Populations.
     stride : int
         Distance between two populations of a cell.
-    openings : (k, 9)
-        Condition (`PRESSURE`, `INFLOW` or `OUTFLOW`), density deviation or speed imposed, remembered mean density, its
-        rate of change, outward normal (3), area in cell faces, present density. The two densities change in place.
+    openings : (k, `OPENING`)
+        Columns from `KIND` (`PRESSURE`, `INFLOW` or `OUTFLOW`) to `DENSITY`. The two densities change in place.
     links : tuple
         (k + 1,) first link of every opening in the following arrays; (l, 6) addresses as in `paths`; (l,) storage place
         of each link's cell; (l,) direction; (m, l, 2) profile coefficients at m moments of a cycle. For an inflow they
@@ -681,15 +676,13 @@ def drive(f: Any, stride: int, openings: Any, links: Any, moment: Any, source: A
     held = _at_ends(f, stride, start, place)
     for k in range(len(openings)):
         opening, first, last = openings[k], start[k], start[k + 1]
-        if opening[0] == INFLOW:
-            speed = inflow_speed(opening, _mean_density(held[first:last], place[first:last]))
+        if opening[KIND] == INFLOW:
+            speed = answered(opening, _mean_density(held[first:last], place[first:last]))
             for n in range(first, last):
                 linear, squared = between(shape, n, moment)
                 source[n] = (linear + squared * speed) * speed
             continue
-        density = opening[1]
-        if opening[0] == OUTFLOW:
-            density = outlet_density(opening, outflow(f, address[first:last]))
+        density = answered(opening, outflow(f, address[first:last]) if opening[KIND] != PRESSURE else 0.0)
         velocity = 0.0, 0.0, 0.0
         for n in range(first, last):
             if n == first or place[n] != place[n - 1]:

@@ -28,7 +28,7 @@ from vstent.flow.lattice.kernels.collision import (
     stress_size,
     thinned,
 )
-from vstent.flow.lattice.kernels.d3q19 import INFLOW, OPPOSITE, OUTFLOW
+from vstent.flow.lattice.kernels.d3q19 import INFLOW, KIND, OPENING, OPPOSITE, PRESSURE, WANTED
 
 THREADS: Final = 8 if config.ENABLE_CUDASIM else 128
 """Number of threads per block; a power of 2. Numba simulates each by a thread of the processor, which is slow."""
@@ -36,21 +36,25 @@ COLUMN: Final = np.array([0, 1, 2, 3, 4, 0, 0, 5, 6, 7, 8, 1, 2, 1, 2, 3, 4, 3, 
 """(19,) column of a segment's row of places that holds the neighbour in each direction (see `packing.Layout.rows`)."""
 SHIFT: Final = np.array([0, 0, 0, 0, 0, 1, -1, 0, 0, 0, 0, 1, -1, -1, 1, 1, -1, -1, 1], np.int32)
 """(19,) number of places from there to the neighbour: neighbours along z are adjacent."""
-NOW, AT_HOME = 0, 1
-"""Entries of the clock, with which the integers begin: the row of the boundary values that applies, and whether
-populations are at home."""
-SPECIAL, SPECIALS, LINK, REFILL, END_OF_LINK, OPENING_OF_END, OPENINGS, ANSWER, IMPOSED = range(2, 11)
-"""Entries with the place where a table begins (see `even_step`), or the number of special cells or openings."""
-BLOCKS, END_CELL, FIRST_BLOCK, COUNT, DONE, PARTS = range(11, 17)
-"""Further places, for `drive`."""
-SEPTA, ADDRESS, SLOT, FIRST_LINK, GROUP_LINK, FIRST_MEMBER, GROUP_MEMBER = range(17, 24)
-"""Further places, for `swap`, `defer` and `balance`."""
-SEPTUM_COUNT, LINKS, WALLS, GROUPS, LOST, CORRECTION = range(24, 30)
-"""Numbers of septa, links, links of walls, and groups; places among the singles, for the same kernels."""
+# fmt: off
+(
+    # The clock: the row of the boundary values that applies, and whether populations are at home.
+    NOW, AT_HOME,
+    # Numbers of special cells, openings, septa, links, links of walls, and groups.
+    SPECIALS, OPENINGS, SEPTUM_COUNT, LINKS, WALLS, GROUPS,
+    # Places among the integers: special cells, the ends of `even_step`, then the tables of `drive` and of the walls.
+    SPECIAL, END_OF_LINK, OPENING_OF_END,
+    BLOCKS, END_CELL, FIRST_BLOCK, COUNT, DONE,
+    SEPTA, ADDRESS, SLOT, FIRST_LINK, GROUP_LINK, FIRST_MEMBER, GROUP_MEMBER,
+    # Places among the singles: `Packed.link`, refill of special cells, mass lost, `Links.correction`.
+    LINK, REFILL, LOST, CORRECTION,
+    # Places among the doubles: answers, sums of blocks, boundary values.
+    ANSWER, PARTS, IMPOSED,
+) = range(30)
+# fmt: on
+"""Entries with which the integers begin; `gpu_tables` writes them."""
 HEAD: Final = 32
-"""Number of these entries, and of the numbers before the limits; `packing.LINE` is the same."""
-OPENING: Final = 9
-"""Number of values per opening in `Links.openings`."""
+"""Number of places kept for them, and for the numbers before the limits; `packing.LINE` is the same."""
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 _U, _WHOLE = np.uint64, np.uint32
 
@@ -66,8 +70,7 @@ def _inlined(function: Callable[..., Any]) -> Any:
 
 
 _between, _deferred = _of_arrays(d3q19.between), _of_arrays(d3q19.deferred)
-_inflow_speed, _outlet_density = _of_arrays(d3q19.inflow_speed), _of_arrays(d3q19.outlet_density)
-_outlet_source = _of_arrays(d3q19.outlet_source)
+_answer, _outlet_source = _of_arrays(d3q19.answered), _of_arrays(d3q19.outlet_source)
 
 
 @_inlined
@@ -389,7 +392,7 @@ def _open(
             end = _end(n, integers)
             k = integers[integers[OPENING_OF_END] + end]
             linear, squared = _between(shape, end, moment)
-            if doubles[OPENING * k] == INFLOW:
+            if doubles[OPENING * k + KIND] == INFLOW:
                 singles[n + 1] = (linear + squared * doubles[answer + k]) * doubles[answer + k]
             else:
                 opening = doubles[OPENING * k : OPENING * (k + 1)]
@@ -728,12 +731,12 @@ def drive(f: Any, integers: Any, singles: Any, doubles: Any, stride: int, code_a
     block = integers[BLOCKS] + 3 * b
     k, i, end = integers[block], integers[block + 1] + t, integers[block + 2]
     first, last = integers[integers[FIRST_BLOCK] + k], integers[integers[FIRST_BLOCK] + k + 1]
-    kind, part = doubles[OPENING * k], integers[PARTS]
+    kind, part = doubles[OPENING * k + KIND], integers[PARTS]
     parts, is_last = cuda.shared.array(THREADS, np.float64), cuda.shared.array(1, np.int32)
     total = 0.0
-    if i < end and kind in (INFLOW, OUTFLOW):
+    if i < end and kind != PRESSURE:  # its answer depends on nothing
         cell = integers[integers[END_CELL] + i]
-        total = _of_opening(f, integers, singles, stride, code_at, cell, k, kind == OUTFLOW)
+        total = _of_opening(f, integers, singles, stride, code_at, cell, k, kind != INFLOW)
     parts[t] = total
     total = _sum(parts, t)
     if t == 0:
@@ -758,10 +761,7 @@ def drive(f: Any, integers: Any, singles: Any, doubles: Any, stride: int, code_a
 def _answered(k: int, total: float, integers: Any, doubles: Any) -> None:
     """Write the answer of opening `k` to the flow rate out of it or the sum of density over its links."""
     opening, answer = doubles[OPENING * k : OPENING * (k + 1)], integers[ANSWER] + k
-    opening[1] = doubles[integers[IMPOSED] + integers[NOW] * (integers[OPENINGS] + 3) + k]
-    if opening[0] == INFLOW:
-        doubles[answer] = _inflow_speed(opening, total / integers[integers[COUNT] + k])
-    elif opening[0] == OUTFLOW:
-        doubles[answer] = _outlet_density(opening, total)
-    else:
-        doubles[answer] = opening[1]
+    opening[WANTED] = doubles[integers[IMPOSED] + integers[NOW] * (integers[OPENINGS] + 3) + k]
+    if opening[KIND] == INFLOW:
+        total /= integers[integers[COUNT] + k]
+    doubles[answer] = _answer(opening, total)
