@@ -45,7 +45,7 @@ def lumpy(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     inward = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) < 0
     faces[inward] = faces[inward][:, ::-1]
     points = points * (1.0 + 0.3 * np.sin(4 * points[:, :1]) * np.cos(3 * points[:, 1:2]))
-    return points + [30.0, -20.0, 50.0], faces.astype(np.int32)
+    return points + np.array([30.0, -20.0, 50.0]), faces.astype(np.int32)
 
 
 def test_a_part_has_the_volume_section_and_wall_of_the_cut_mesh() -> None:
