@@ -3,6 +3,7 @@
 import io
 import re
 import tokenize
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -48,6 +49,7 @@ EXCEPTIONS = {
 """File and expression -> why it may stand there."""
 
 
+@cache
 def spoken(path: Path) -> list[tuple[int, str]]:
     """Return what a file says to people, with line numbers: strings and comments of code, all of a page."""
     text = path.read_text(encoding="utf-8")
@@ -63,6 +65,7 @@ def spoken(path: Path) -> list[tuple[int, str]]:
     ]
 
 
+@cache
 def pages() -> list[Path]:
     """Return every file that speaks, generated and recorded ones left out."""
     found = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]

@@ -10,6 +10,7 @@ from browsing import BROWSER, FLAGS, browsing, in_time, needs_browser, playwrigh
 from test_image_step import analytic_case
 
 from vstent.app.cases import Store
+from vstent.errors import InputError
 
 pytestmark = needs_browser
 
@@ -186,7 +187,7 @@ def test_only_a_case_of_the_workspace_is_deleted(client, workspace, tmp_path_fac
     elsewhere = tmp_path_factory.mktemp("elsewhere")
     analytic_case(elsewhere)
     case = Store(workspace).adopt(elsewhere / "analytic")
-    with pytest.raises(Exception, match="Delete it there"):
+    with pytest.raises(InputError, match="Delete it there"):
         Store(workspace).remove(case)
     assert (elsewhere / "analytic").is_dir()
     assert client.get("/api/cases/analytic/picture").status_code == 404
@@ -233,6 +234,8 @@ def test_every_step_fits_and_is_accessible(client, size):
         page.locator(".brand").click()
         page.wait_for_selector(".recent-card")
         assert serious(page) == []
+    if not AXE.is_file():
+        pytest.skip("everything fits, but axe-core, which checks accessibility, is not installed (npm ci in viewer/)")
 
 
 def serious(page):

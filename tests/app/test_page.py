@@ -301,7 +301,7 @@ def test_deployed_numbers_are_those_of_the_measures(client, case, workspace):
     choose(client, case, treatments=[SILK])
 
 
-def test_the_section_has_the_phantoms_radius(client, case):
+def test_the_section_has_the_phantoms_radius(client, case, workspace):
     start, _ = app_case.opened(client.post(f"{case}/sketch", json=wanted(SILK)))
     place = start["ends_mm"][0] + 1.0
     section = client.get(
@@ -311,6 +311,10 @@ def test_the_section_has_the_phantoms_radius(client, case):
     near = np.linalg.norm(segments, axis=2).max(axis=1) < section["artery_diameter_mm"]
     length = np.linalg.norm(segments[near, 1] - segments[near, 0], axis=1).sum()
     assert length / np.pi == pytest.approx(section["artery_diameter_mm"], rel=0.03)
+    middle_mm = anatomy_of(client, case, workspace).parent.axis.at(np.array([place]))[0]
+    phantom = phantoms.demo_phantom().parent
+    nearest = np.linalg.norm(phantom.points_mm - middle_mm, axis=1).argmin()
+    assert section["artery_diameter_mm"] == pytest.approx(2 * phantom.inscribed_radius_mm[nearest], rel=0.01)
     assert section["device_diameter_mm"] < section["artery_diameter_mm"]
 
 
@@ -445,8 +449,7 @@ def test_a_job_computes_what_was_chosen_when_it_was_started(client, case):
     client.post(f"{case}/jobs/flow")
     changed = choose(client, case, treatments=[alone("enterprise")]).json()  # before the job has loaded its modules
     assert changed["job"]["stage"] == ""
-    while client.get(case).json()["job"]["stage"] == "":
-        time.sleep(0.02)
+    app_case.until(lambda: client.get(case).json()["job"]["stage"])
     client.post(f"{case}/undo", json={"revision": changed["revision"]})
     view = app_case.wait(client, case.rpartition("/")[2])
     assert view["choices"] == before["choices"]
@@ -473,8 +476,7 @@ def test_a_flow_after_another_choice_of_the_vessel_finds_the_vessel_first(client
     changed = choose(client, case, upstream_mm=12.0).json()
     assert changed["steps"]["vessel"] == "stale"
     client.post(f"{case}/jobs/flow")
-    while client.get(case).json()["anatomy"] == before["anatomy"]:
-        time.sleep(0.05)
+    app_case.until(lambda: client.get(case).json()["anatomy"] != before["anatomy"])
     view = client.delete(f"{case}/jobs").json()  # the former anatomy is not kept any more
     assert [view["steps"][step] for step in STEPS[:3]] == ["done"] * 3
     assert client.get(f"{case}/anatomy").status_code == 200
@@ -507,10 +509,7 @@ def test_a_tab_is_told_of_every_change(client, case):
 def test_a_server_that_was_killed_at_work_goes_on_when_it_starts_again(artery, tmp_path):
     with app_case.served(tmp_path, artery) as client:
         case = client.get("/api/cases").json()["opened"]
-        until = time.monotonic() + 60
-        while client.get(f"/api/cases/{case}").json()["job"] is None:
-            assert time.monotonic() < until
-            time.sleep(0.02)
+        app_case.until(lambda: client.get(f"/api/cases/{case}").json()["job"])
     state = json.loads((tmp_path / case / "app.json").read_text())
     assert (state["job"], state["anatomy"]) == ("anatomy", "")
     with app_case.served(tmp_path) as client:
@@ -668,8 +667,7 @@ def test_slices_hold_the_scans_voxels_and_the_live_surface_is_its_wall(tmp_path)
     write_dicom(vstent_image(voxels), tmp_path / "scan")
     with app_case.served(tmp_path / "cases", tmp_path / "scan") as client:
         case = f"/api/cases/{client.get('/api/cases').json()['opened']}"
-        while not client.get(case).json()["has_input"]:
-            time.sleep(0.02)
+        app_case.until(lambda: client.get(case).json()["has_input"])
         image = read_image(tmp_path / "scan")
         told, data = app_case.opened(client.get(f"{case}/image/slice", params={"axis": 2, "index": 15}))
         shown = app_case.numbers(told["values"], data).reshape(told["height"], told["width"])

@@ -57,6 +57,14 @@ def wait(client, case, seconds=300):
     raise AssertionError(f"still at work after {seconds} s: {view['job']}")
 
 
+def until(is_so, seconds=60):
+    """Wait until it is so."""
+    end = time.monotonic() + seconds
+    while not is_so():
+        assert time.monotonic() < end, f"not so after {seconds} s"
+        time.sleep(0.02)
+
+
 def opened(answer):
     """Manifest and bytes of a binary answer."""
     data = answer.content

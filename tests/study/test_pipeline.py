@@ -30,7 +30,7 @@ from vstent.study.crate import write_crate
 from vstent.study.folder import implant_folder
 from vstent.study.keys import hash_of, study_keys
 from vstent.study.outputs import write_anatomy
-from vstent.study.pipeline import restore_vessel, run
+from vstent.study.pipeline import restore_vessel, run, trace_vessel
 from vstent.study.settings import AnatomySettings, InputSettings, Settings
 from vstent.study.stages import deploy_implant, engine_folders, size_of
 from vstent.study.store import Key, Store
@@ -310,9 +310,11 @@ def test_of_two_vessels_in_one_surface_the_one_at_the_point_given_is_taken(tmp_p
     faces = np.concatenate([wide.faces, thin.faces + len(wide.vertices_mm)])
     write_stl(tmp_path / "both.stl", Surface(vertices, faces))
     settings = settings_of()
-    assert stages._vessel(tmp_path / "both.stl", settings).lumen.vertices_mm[:, 0].max() < 3.0
+    usual = trace_vessel(tmp_path / "both.stl", tmp_path / "usual", settings, lambda *_: None)
+    assert usual.lumen.vertices_mm[:, 0].max() < 3.0
     settings = replace(settings, anatomy=AnatomySettings(**{given: (30.0, 0.0, 0.0)}))
-    assert stages._vessel(tmp_path / "both.stl", settings).lumen.vertices_mm[:, 0].min() > 27.0
+    other = trace_vessel(tmp_path / "both.stl", tmp_path / "other", settings, lambda *_: None)
+    assert other.lumen.vertices_mm[:, 0].min() > 27.0
 
 
 def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(

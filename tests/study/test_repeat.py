@@ -16,6 +16,7 @@ import pytest
 from vstent import phantoms
 from vstent.cli import main
 from vstent.devices.treatment import Implant, Placing, Treatment
+from vstent.errors import ReadError
 from vstent.fields import sections_of
 from vstent.flow.settings import Blood, CarreauYasuda, FlowSettings, Numerics
 from vstent.flow.waveform import OLDER_ADULT_ICA
@@ -234,5 +235,5 @@ def test_a_machine_without_wide_and_fused_instructions_agrees_within_what_is_sta
 
 
 def test_an_unfinished_folder_is_no_crate(tmp_path):
-    with pytest.raises(Exception, match="holds no finished case"):
+    with pytest.raises(ReadError, match="holds no finished case"):
         write_crate(tmp_path, {}, "2026-01-01")
