@@ -450,7 +450,7 @@ class Live:
         Parameters
         ----------
         name : treatment to include; None: none.
-        implant : id of the implant whose diameters are told; None: the first.
+        implant : id of the implant whose diameters are returned; None: the first.
         abscissa_mm : position of the plane along the parent axis.
         """
         with LOCK:

@@ -62,7 +62,7 @@ class Seen(Strict):
 
 
 class ImplantWanted(Strict):
-    """A treatment to draw, and the implant whose place is told."""
+    """A treatment to draw, and the implant whose place is returned."""
 
     treatment: Treatment
     implant: str = Field(max_length=60)
