@@ -142,6 +142,26 @@ def image_file(suffix: str, *, packed: bool = False) -> bytes:
         return Path(folder, f"a{suffix}").read_bytes()
 
 
+@cache
+def vtk_image_file(suffix: str) -> bytes:
+    """Return the scan in a format of VTK's: ``.vti`` or legacy ``.vtk``."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonDataModel import vtkStructuredPoints
+    from vtkmodules.vtkIOLegacy import vtkStructuredPointsWriter
+    from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
+
+    data = vtkStructuredPoints()
+    data.SetDimensions(scan().voxels.shape)
+    data.SetSpacing([SPACING_MM] * 3)
+    data.GetPointData().SetScalars(numpy_to_vtk(np.asarray(scan().voxels).ravel(order="F"), deep=True))
+    writer = (vtkXMLImageDataWriter if suffix == ".vti" else vtkStructuredPointsWriter)()
+    writer.SetInputData(data)
+    with TemporaryDirectory() as folder:
+        writer.SetFileName(f"{folder}/a{suffix}")
+        writer.Write()
+        return Path(folder, f"a{suffix}").read_bytes()
+
+
 def itk_scan() -> SimpleITK.Image:
     """Return the scan as ITK has it."""
     image = SimpleITK.GetImageFromArray(np.ascontiguousarray(scan().voxels.T))
