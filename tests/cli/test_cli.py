@@ -1,6 +1,7 @@
 """The command line as a user meets it: help, errors, exit codes, resume."""
 
 import argparse
+import io
 import json
 import subprocess
 import sys
@@ -93,9 +94,15 @@ def test_the_parts_refuse_bad_input_as_the_whole_does(
     assert not (tmp_path / "out").exists()
 
 
-def test_trace_writes_wall_openings_and_centerlines(artery: Path, tmp_path: Path) -> None:
+def test_trace_writes_wall_openings_and_centerlines(
+    artery: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the output is redirected on a system without the letters of its tables."""
+    printed = io.BytesIO()
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(printed, encoding="cp932", write_through=True))
     out, phantom = tmp_path / "out", phantoms.demo_phantom()
     assert main(["trace", str(artery), "--out", str(out), "--units", "mm"]) == 0
+    assert b" mm? " in printed.getvalue()
     assert sorted(file.name for file in out.iterdir()) == [CACHE, "centerlines.vtp", "openings.json", "vessel.vtp"]
     openings = json.loads((out / "openings.json").read_text())["openings"]
     assert [o["role"] for o in openings] == ["inlet", "outlet_1", "outlet_2"]

@@ -142,6 +142,26 @@ def image_file(suffix: str, *, packed: bool = False) -> bytes:
         return Path(folder, f"a{suffix}").read_bytes()
 
 
+@cache
+def vtk_image_file(suffix: str) -> bytes:
+    """Return the scan in a format of VTK's: ``.vti`` or legacy ``.vtk``."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonDataModel import vtkStructuredPoints
+    from vtkmodules.vtkIOLegacy import vtkStructuredPointsWriter
+    from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
+
+    data = vtkStructuredPoints()
+    data.SetDimensions(scan().voxels.shape)
+    data.SetSpacing([SPACING_MM] * 3)
+    data.GetPointData().SetScalars(numpy_to_vtk(np.asarray(scan().voxels).ravel(order="F"), deep=True))
+    writer = (vtkXMLImageDataWriter if suffix == ".vti" else vtkStructuredPointsWriter)()
+    writer.SetInputData(data)
+    with TemporaryDirectory() as folder:
+        writer.SetFileName(f"{folder}/a{suffix}")
+        writer.Write()
+        return Path(folder, f"a{suffix}").read_bytes()
+
+
 def itk_scan() -> SimpleITK.Image:
     """Return the scan as ITK has it."""
     image = SimpleITK.GetImageFromArray(np.ascontiguousarray(scan().voxels.T))
@@ -426,7 +446,7 @@ def own_catalogue(out: Path) -> Iterator[None]:
 MESH, SCAN, SLICES, RAW = "surface files", "scans with a header", "DICOM series", "raw volumes"
 SHAPE, OPTION, DEVICE, MACHINE = "surfaces that are read", "options", "devices of one's own", "machine and folders"
 
-_TORN = "holds no surface, or fewer triangles"
+_TORN = "fewer triangles than it states"
 _ANNOUNCED = "breaks off"
 _DAMAGED = "is damaged"
 _SOURCED = 'source = "none", confidence = "estimated", reason = "none"'
@@ -530,7 +550,7 @@ FAULTS: tuple[Fault, ...] = (
         "PLY that announces 10^9 vertices",
         trace("a.ply", b"ply\nformat ascii 1.0\nelement vertex 1000000000\nproperty float x\nend_header\n1\n"),
         INPUT,
-        _TORN,
+        "damaged",
     ),
     Fault(MESH, "VTK, cut after its title", cut(".vtk", b"DATASET"), INPUT, _TORN),
     Fault(MESH, "VTK, cut in its points", cut(".vtk", 0.3), INPUT, _TORN),
@@ -539,7 +559,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault(MESH, "VTP, cut before its points", cut(".vtp", b"<Points"), INPUT, _TORN),
     Fault(MESH, "VTP, cut in its triangles", cut(".vtp", 0.9), INPUT, _TORN),
     Fault(MESH, "VTP, last line missing", cut(".vtp", b"</VTKFile"), INPUT, _TORN),
-    Fault(MESH, "VTP whose packed data announce 4 GB", trace("a.vtp", packed_vtp), INPUT, _TORN),
+    Fault(MESH, "VTP whose packed data announce 4 GB", trace("a.vtp", packed_vtp), INPUT, "damaged"),
     Fault(MESH, "OBJ, cut in its vertices", cut(".obj", 0.2), INPUT, _TORN),
     Fault(MESH, "OBJ, cut in its triangles", cut(".obj", 0.7), INPUT, _TORN),
     Fault(MESH, "lines without triangles", trace("a.obj", b"v 0 0 0\nv 1 0 0\nl 1 2\n"), INPUT, _TORN),

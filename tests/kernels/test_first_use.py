@@ -4,7 +4,9 @@ import importlib
 import os
 import subprocess
 import sys
+import tempfile
 import threading
+from pathlib import Path
 
 import pytest
 from numba import njit
@@ -167,10 +169,46 @@ def test_a_kernel_is_compiled_anew_when_a_function_in_another_file_that_it_calls
     assert answers == [(1, 1), (1, 1), (2, 1)]
 
 
-@pytest.mark.parametrize(("writable", "is_moved"), [(True, False), (False, True)])
-def test_where_no_cache_can_be_written_kernels_are_kept_with_temporary_files(monkeypatch, writable, is_moved):
-    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
-    monkeypatch.setattr(os, "access", lambda path, mode: writable)
+@pytest.fixture
+def nowhere(monkeypatch, tmp_path):
+    """Let no place of numba's be writable, and temporary files lie in a folder of their own."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "/proc/none")
+    writable = os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).is_relative_to(tmp_path) and writable(path, mode))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    return tmp_path / f"vstent-{os.getuid()}"
+
+
+def test_where_no_cache_can_be_written_kernels_are_kept_in_a_private_folder(nowhere):
+    for _ in range(2):
+        cache.choose_folder()
+        assert os.environ["NUMBA_CACHE_DIR"] == str(nowhere)
+        assert nowhere.stat().st_mode & 0o777 == 0o700
+        os.environ["NUMBA_CACHE_DIR"] = "/proc/none"
+
+
+def test_a_folder_that_can_be_written_is_kept(nowhere, monkeypatch):
+    for given in (nowhere.parent / "new" / "folder", nowhere.parent):
+        monkeypatch.setenv("NUMBA_CACHE_DIR", str(given))
+        cache.choose_folder()
+        assert os.environ["NUMBA_CACHE_DIR"] == str(given)
+
+
+@pytest.mark.parametrize("trap", ["link", "open to others", "of another user", "file"])
+def test_code_that_others_may_have_put_into_a_temporary_folder_is_not_run(nowhere, monkeypatch, trap):
+    if trap == "link":
+        (nowhere.parent / "theirs").mkdir(mode=0o700)
+        nowhere.symlink_to(nowhere.parent / "theirs")
+    elif trap == "file":
+        nowhere.touch()
+    else:
+        nowhere.mkdir(mode=0o700)
+        nowhere.chmod(0o770 if trap == "open to others" else 0o700)
+    if trap == "of another user":
+        users = iter([os.geteuid(), os.geteuid() + 1])  # for the name, and for the owner
+        monkeypatch.setattr(os, "getuid", lambda: next(users))
     cache.choose_folder()
-    assert ("NUMBA_CACHE_DIR" in os.environ) == is_moved
-    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    chosen = Path(os.environ["NUMBA_CACHE_DIR"])
+    assert chosen.parent == nowhere.parent
+    assert chosen != nowhere
+    assert chosen.stat().st_mode & 0o777 == 0o700

@@ -31,6 +31,16 @@ BULGING: Final = 1.4
 """Smallest prominence of an aneurysm; those of siphons and forks are below 1.3."""
 
 
+MOST_PIECES: Final = 4
+"""Largest number of pieces that are compared."""
+
+
+def similar(sizes: NDArray[Any]) -> list[int]:
+    """Return the numbers of the largest piece and of those of comparable size, the largest first."""
+    largest = np.argsort(-sizes, kind="stable")[:MOST_PIECES]
+    return [int(k) for k in largest if sizes[k] > COMPARABLE * sizes[largest[0]]]
+
+
 def bulging(sizes: NDArray[Any], prominence_of: Callable[[int], float]) -> int:
     """Return the number of the piece to keep: the largest of those with a bulge, or the largest of all.
 
@@ -39,11 +49,9 @@ def bulging(sizes: NDArray[Any], prominence_of: Callable[[int], float]) -> int:
     sizes : (n,) sizes of the pieces.
     prominence_of : returns the `prominence` of a piece.
     """
-    order = np.argsort(-np.asarray(sizes), kind="stable")
-    similar = [int(k) for k in order if sizes[k] > COMPARABLE * sizes[order[0]]]
-    if len(similar) < 2:
-        return similar[0]
-    return next((k for k in similar if prominence_of(k) >= BULGING), similar[0])
+    pieces = similar(sizes)
+    found = (k for k in pieces if len(pieces) > 1 and prominence_of(k) >= BULGING)
+    return next(found, pieces[0])
 
 
 def prominence(inside: Bools, spacing_mm: Floats) -> float:

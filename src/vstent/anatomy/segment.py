@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.special import ndtr
 
-from vstent.anatomy.bulge import COMPARABLE, bulging, prominence
+from vstent.anatomy.bulge import bulging, prominence, similar
 from vstent.anatomy.masks import prepared
 from vstent.errors import VesselError
 from vstent.geometry.image import Image
@@ -120,7 +120,7 @@ class Lumen:
     n_above: int
     """Number of voxels of the whole scan above the threshold."""
     others_mm: tuple[Floats, ...] = ()
-    """Centers (3,) of other objects of similar size, in LPS mm."""
+    """Centers (3,) of the boxes around other objects of similar size, in LPS mm."""
 
     @property
     def voxel_mm(self) -> float:
@@ -295,8 +295,8 @@ def _lumen(image: Image, threshold: float, at_mm: Floats | None) -> Lumen:
     field[(part > 0) & (part != chosen)] = below
     affine = np.array(image.affine_mm)
     affine[:3, 3] = image.to_mm(np.array([[s.start for s in box]]))[0]
-    others = [k for k in np.flatnonzero(size > COMPARABLE * size.max()) if k != chosen]
-    middles = [image.to_mm(np.array(ndimage.center_of_mass(label == k))[None])[0] for k in others]
+    others = [_box(label, k) for k in similar(size) if k != chosen]
+    middles = [image.to_mm(np.array([[0.5 * (s.start + s.stop - 1) for s in box]]))[0] for box in others]
     return Lumen(field, affine, threshold, int(size[chosen]), int(size.sum()), tuple(middles))
 
 

@@ -8,6 +8,7 @@ import errno
 import os
 import sys
 from collections.abc import Sequence
+from io import TextIOWrapper
 from typing import Final
 
 from vstent.cli import angiogram, app, batch, demo, devices, export, flow, rank, restore, run, trace
@@ -41,6 +42,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     # The linear systems are too small for several threads of the linear algebra library.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # a redirect on Windows has few characters; others become question marks
+            stream.reconfigure(errors="replace")
     with borne_interrupts():
         return _done(_parser().parse_args(argv))
 

@@ -3,6 +3,7 @@
 The child (`vstent.io.child`) writes its arrays into a temporary folder, from which they are mapped into memory.
 """
 
+import errno
 import json
 import os
 import subprocess
@@ -93,7 +94,13 @@ def read_apart(
         _raise(words, dead)
         # Windows cannot remove mapped files.
         mode: Literal["r"] | None = None if sys.platform == "win32" else "r"
-        yield {file.stem: np.load(file, mmap_mode=mode) for file in Path(folder).glob("*.npy")}, words
+        try:
+            arrays = {file.stem: np.load(file, mmap_mode=mode) for file in Path(folder).glob("*.npy")}
+        except OSError as error:
+            if error.errno == errno.ENOMEM:
+                raise MemoryError from error
+            raise
+        yield arrays, words
 
 
 def _raise(words: Mapping[str, Any], dead: str) -> None:

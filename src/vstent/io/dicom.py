@@ -279,6 +279,14 @@ def _flaw(dataset: Any) -> str:
 
 def _choose(path: Path) -> tuple[list[tuple[Path, Any]], tuple[str, ...]]:
     """Return the files of one series (that of the file given, or the most suitable one) and notes."""
+    try:
+        return _chosen(path)
+    except damage():  # pydicom raises faults of a header when its values are used
+        raise ReadError(f"{path} holds a DICOM file with a damaged header. Copy it again, or remove it.") from None
+
+
+def _chosen(path: Path) -> tuple[list[tuple[Path, Any]], tuple[str, ...]]:
+    """Return what `_choose` does; faults of headers are raised as they are."""
     found: dict[tuple[str, bool, bool], list[tuple[Path, Any]]] = {}
     for file, dataset in _headers(path):
         if dataset is not None:
@@ -292,7 +300,7 @@ def _choose(path: Path) -> tuple[list[tuple[Path, Any]], tuple[str, ...]]:
         raise ReadError(f"{path} holds no DICOM images. Check the path, or export the series again.")
     chosen = max(wanted, key=lambda one: one.rank)
     _refuse_flaw(chosen)
-    n_bytes = sum(_n_voxels(one) * int(getattr(one, "BitsAllocated", 16)) // 8 for _, one in chosen.files)
+    n_bytes = sum(_n_voxels(one) * int(getattr(one, "BitsAllocated", 16) or 16) // 8 for _, one in chosen.files)
     refuse_bomb(f"{path} states {counted(chosen.n_slices, 'slice')}", n_bytes, _size(file for file, _ in chosen.files))
     if len(every) < 2 or not path.is_dir():
         return chosen.files, ()

@@ -56,11 +56,14 @@ def existing(path: Path) -> Path:
     Raises
     ------
     ReadError
-        The path does not exist, or is something else, such as a named pipe, on which reading would wait forever.
+        The path does not exist, its name is not text, or it is something else, such as a named pipe, on which reading
+        would wait forever.
     """
     path = Path(path)
     if not path.exists():
         raise ReadError(f"{path} does not exist: check the path.")
+    if any("\udc80" <= letter <= "\udcff" for letter in str(path)):
+        raise ReadError(f"{path} has a name that is not text in this system's encoding. Rename it.")
     if not (path.is_file() or path.is_dir()):
         raise ReadError(f"{path} is neither a file nor a folder. Give a scan or a surface.")
     return path

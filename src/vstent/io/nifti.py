@@ -58,7 +58,8 @@ def read_nifti(path: Path, *, has_spacing: bool) -> Image:
     code = int(header["xyzt_units"]) % 8
     if code not in MM_PER_UNIT and not has_spacing:
         raise UnitError(f"{path.name} has the length unit {code}, which NIfTI does not define. Give --spacing in mm.")
-    affine, notes = _affine(header, shape, spacing)
+    with np.errstate(all="ignore"):  # a frame of huge numbers is refused later
+        affine, notes = _affine(header, shape, spacing)
     to_mm = np.diag([*[MM_PER_UNIT.get(code, 1.0)] * 3, 1.0])
     return Image(_scaled(_stored(header, shape, path), header), to_mm @ affine, notes=notes)
 

@@ -1,7 +1,11 @@
 """Location of numba's compiled kernels, and their removal when the sources have changed."""
 
+import atexit
 import os
+import shutil
+import stat
 import tempfile
+from contextlib import suppress
 from hashlib import sha1, sha256
 from pathlib import Path
 
@@ -16,25 +20,44 @@ STAMP = "vstent.sources"
 
 def _user_cache() -> Path:
     """Return the user's cache folder."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
 
 
 def choose_folder() -> None:
-    """Let numba keep compiled kernels in a temporary folder where no other place is writable.
+    """Let numba keep compiled kernels in a private temporary folder where no other place is writable.
 
-    Numba uses the folder of the source or the user's cache, and fails where it can write to neither.
+    Numba uses ``NUMBA_CACHE_DIR``, the folder of the source or the user's cache, and fails where it can write to none.
     """
-    if not hasattr(os, "getuid"):
-        return
-    places = Path(__file__).parent, _user_cache(), Path.home()
-    if not any(place.is_dir() and os.access(place, os.W_OK) for place in places):
-        os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(tempfile.gettempdir()) / f"vstent-{os.getuid()}"))
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    places = [Path(given)] if given else []
+    if hasattr(os, "getuid") and not any(map(_is_writable, [*places, Path(__file__).parent, _user_cache()])):
+        os.environ["NUMBA_CACHE_DIR"] = str(_private_folder())
+
+
+def _is_writable(place: Path) -> bool:
+    """Return whether a folder is writable, or can be made."""
+    there = next((one for one in (place, *place.parents) if one.exists()), place)
+    return place.is_absolute() and there.is_dir() and os.access(there, os.W_OK)
+
+
+def _private_folder() -> Path:
+    """Return a temporary folder that no other user can write to, because numba runs the code that it finds there."""
+    shared = Path(tempfile.gettempdir()) / f"vstent-{os.getuid()}"
+    with suppress(OSError):
+        shared.mkdir(mode=0o700, exist_ok=True)
+        state = shared.lstat()
+        if stat.S_ISDIR(state.st_mode) and state.st_uid == os.getuid() and not state.st_mode & 0o077:
+            return shared
+    own = tempfile.mkdtemp(prefix="vstent-")
+    atexit.register(shutil.rmtree, own, ignore_errors=True)
+    return Path(own)
 
 
 def kept_in(sources: Path) -> Path:
     """Return the folder where numba keeps what it compiles from a source folder; it is writable."""
     name = f"{sources.name}_{sha1(str(sources).encode(), usedforsecurity=False).hexdigest()}"
-    if given := os.environ.get("NUMBA_CACHE_DIR"):
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    if given and _is_writable(Path(given)):
         return Path(given) / name
     return sources / "__pycache__" if os.access(sources, os.W_OK) else _user_cache() / "numba" / name
 
