@@ -19,6 +19,9 @@ END_MM: Final = 2.0
 """Length in mm over which the width of an end is measured."""
 NEAR_SAC_MM: Final = 4.0
 """An opening closer than this to the wall of a sac, in mm, is reported."""
+UNCERTAIN: Final = 1.25
+"""A neck is reported as uncertain where the largest area of nearly as good planes exceeds the smallest by this
+factor."""
 STENOSED: Final = 0.7
 """A stenosis is reported where the width beside a neck is below this fraction of the widths on both sides of it."""
 STENOSED_REACH: Final = 2.0
@@ -44,6 +47,30 @@ def told(vessel: Vessel, path: int, bulges: list[Bulge], aneurysms: tuple[Aneury
         *_fusiform(line, sacs),
         *(note for sac in aneurysms for note in _stenosed(line, sac)),
     )
+
+
+def necks_told(aneurysms: Sequence[Aneurysm]) -> tuple[str, ...]:
+    """Return notes on necks whose plane is uncertain, or missing.
+
+    Parameters
+    ----------
+    aneurysms : sacs that were cut off.
+    """
+    notes = []
+    for aneurysm in aneurysms:
+        if aneurysm.plane is None:
+            notes.append(
+                f"No plane separates the sac at {place(aneurysm.neck_mm.mean(axis=0))} from all arteries. Its heights, "
+                "widths and volume by plane refer to the mean plane of its neck curve."
+            )
+            continue
+        low_mm2, high_mm2 = aneurysm.plane.area_band_mm2
+        if high_mm2 > UNCERTAIN * low_mm2:
+            notes.append(
+                f"The neck is uncertain: its area is {aneurysm.plane.area_mm2:.1f} mm2, and {low_mm2:.1f} to "
+                f"{high_mm2:.1f} mm2 for planes that separate the sac nearly as well."
+            )
+    return tuple(notes)
 
 
 def candidates_told(aneurysms: Sequence[Aneurysm], candidates: Sequence[Candidate]) -> tuple[str, ...]:

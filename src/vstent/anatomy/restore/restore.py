@@ -18,7 +18,7 @@ from vstent.anatomy.restore.bulges import Bulge, find_bulges, flat_bulges
 from vstent.anatomy.restore.candidates import classified
 from vstent.anatomy.restore.drawn import Drawn, cut_along
 from vstent.anatomy.restore.landing import Landing, close_landing
-from vstent.anatomy.restore.notes import candidates_told, flat_told, told
+from vstent.anatomy.restore.notes import candidates_told, flat_told, necks_told, told
 from vstent.anatomy.restore.path import PASSING, parent_path, reach_of
 from vstent.anatomy.restore.plane import plane_sac
 from vstent.anatomy.restore.sac import cut_sac, drawn_sac, is_beside_branch, is_in_one, is_sac
@@ -90,7 +90,12 @@ def restore(
     aneurysms = tuple(sorted(sacs, key=lambda sac: -sac.sac.volume_mm3))
     flat = None if aneurysms or at_mm is not None else _flat_sac(vessel, outlet_mm, path, landing)
     parent = Path(PARENT, landing.axis, landing.section_radius_mm, landing.surface, landing.is_restored.ravel())
-    notes = (*told(vessel, path, bulges or found, aneurysms), *candidates_told(aneurysms, candidates), *flat_told(flat))
+    notes = (
+        *told(vessel, path, bulges or found, aneurysms),
+        *(necks_told(aneurysms) if drawn is None else ()),
+        *candidates_told(aneurysms, candidates),
+        *flat_told(flat),
+    )
     return continued(Anatomy(vessel, (parent,), aneurysms, notes, tuple(candidates)))
 
 
