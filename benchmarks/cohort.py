@@ -23,11 +23,9 @@ from vstent.cli import main
 from vstent.cohort.batch import collect, left_to_do, run_cohort
 from vstent.cohort.cases import Case, find_cases
 from vstent.cohort.work import COST, Row
-from vstent.devices.treatment import with_device
 from vstent.io.writers import write_stl
 from vstent.phantoms import Phantom
 from vstent.study.crews import DaskCluster
-from vstent.study.settings import InputSettings, Settings
 
 SEED = 7
 EDGE_MM = 0.3
@@ -70,10 +68,10 @@ def cohort(count: int, jobs: int) -> None:
             write_stl(path, phantoms.phantom_surface(case(number), edge_mm=EDGE_MM))
     out, began = folder / f"out-{count}", time.perf_counter()
     devices = [word for device in DEVICES for word in ("--device", device)]
-    given = [str(folder / f"scans-{count}"), "--out", str(out), "--no-flow", "--units", "mm", "--jobs", str(jobs)]
-    main(["batch", *given, *devices])
-    settings = Settings(InputSettings(units="mm"), treatments=tuple(map(with_device, DEVICES)), flow=None)
-    cases = find_cases(folder / f"scans-{count}", settings)
+    words = [str(folder / f"scans-{count}"), "--out", str(out), "--no-flow", "--units", "mm", "--jobs", str(jobs)]
+    main(["batch", *words, *devices])
+    given = {"device": DEVICES, "no-flow": True, "units": "mm"}
+    cases = find_cases(folder / f"scans-{count}", given)
     rows = collect(cases, out)
     print("| cases | by | rows done | rows failed | wall, s | CPU s a case | most | memory, MB |")
     print("|---|---|---|---|---|---|---|---|")
