@@ -57,16 +57,7 @@ class Sac:
         The distance is exact for a sphere and first-order accurate near the wall of an ellipsoid: k0 (k0 - 1) / k1 with
         k0 = abs(x / r) and k1 = abs(x / r^2).
 
-        Parameters
-        ----------
-        points_mm : (n, 3) points.
-
-        Returns
-        -------
-        distance_mm : Floats
-            (n,) signed distance, negative inside.
-        gradient : Floats
-            (n, 3) unit gradient.
+        Shapes: `points_mm` (n, 3).
         """
         local = points_mm - self.center_mm
         along = (local @ self.direction)[:, None] * self.direction
@@ -109,16 +100,7 @@ class Phantom:
 
         Tubes are extended straight beyond their ends, except at an end inside the parent artery.
 
-        Parameters
-        ----------
-        points_mm : (n, 3) points.
-
-        Returns
-        -------
-        distance_mm : Floats
-            (n,) signed distance, negative in the lumen.
-        gradient : Floats
-            (n, 3) unit gradient.
+        Shapes: `points_mm` (n, 3).
         """
         value, gradient = tube_implicit_mm(self.parent, points_mm)
         parts = [tube_implicit_mm(branch, points_mm, begins_inside=self._feeds(branch)) for branch in self.branches]
@@ -194,18 +176,7 @@ def tube_implicit_mm(tube: Centerline, points_mm: Floats, *, begins_inside: bool
 
     The distance is that to the axis minus the radius at the nearest point of the axis. The ends are extended straight.
 
-    Parameters
-    ----------
-    tube : axis and radius.
-    points_mm : (n, 3) points.
-    begins_inside : whether the first end lies inside another tube and is not extended.
-
-    Returns
-    -------
-    distance_mm : Floats
-        (n,) distance, negative inside.
-    direction : Floats
-        (n, 3) unit vectors away from the axis.
+    Shapes: `points_mm` (n, 3).
     """
     points, radius = tube.points_mm, tube.inscribed_radius_mm
     reach = np.linspace(4.0, 0.0, 40, endpoint=False)[:, None] * radius.max()
@@ -238,14 +209,7 @@ def tube(*, length_mm: float = 20.0, radius_mm: float = 2.0, end_radius_mm: floa
 
 
 def torus_arc(*, bend_radius_mm: float = 8.0, angle_rad: float = np.pi, radius_mm: float = 2.0) -> Phantom:
-    """Return part of a torus around the y axis: an artery of constant curvature.
-
-    Parameters
-    ----------
-    bend_radius_mm : radius of the axis.
-    angle_rad : angle of the bend.
-    radius_mm : radius of the artery.
-    """
+    """Return part of a torus around the y axis: an artery of constant curvature."""
     angle = np.linspace(0.0, angle_rad, int(bend_radius_mm * angle_rad / AXIS_STEP_MM) + 1)
     points = bend_radius_mm * np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=-1)
     return Phantom("torus arc", Centerline(points, np.full(len(angle), radius_mm)))
@@ -299,14 +263,7 @@ def with_sac(
 ) -> Phantom:
     """Return a phantom with a sac on the wall of the parent artery.
 
-    Parameters
-    ----------
-    phantom : the phantom without a sac.
-    abscissa_mm : position of the sac along the parent artery's axis.
-    width_mm : diameter across the height.
-    neck_mm : length of the neck along a straight artery; across it the neck is shorter.
-    elongation : height radius over width radius.
-    direction : (3,) direction from the axis to the sac; None: the outer side of the bend.
+    Shapes: `direction` (3,).
     """
     parent = phantom.parent
     i = int(np.abs(parent.abscissa_mm - abscissa_mm).argmin())
@@ -323,11 +280,7 @@ def with_sac(
 def with_bleb(phantom: Phantom, *, direction: Floats, radius_mm: float = 1.2) -> Phantom:
     """Return a phantom with a round daughter sac, half of which protrudes from the sac.
 
-    Parameters
-    ----------
-    phantom : a phantom with a sac.
-    direction : (3,) direction from the center of the sac.
-    radius_mm : radius of the daughter sac.
+    Shapes: `direction` (3,).
 
     Raises
     ------
@@ -347,13 +300,7 @@ def with_branch(
 ) -> Phantom:
     """Return a phantom with a straight side branch.
 
-    Parameters
-    ----------
-    phantom : the phantom.
-    abscissa_mm : position along the parent artery's axis where the branch begins.
-    direction : (3,) direction of the branch.
-    radius_mm : radius of the branch.
-    length_mm : length of the branch from the axis of the parent artery.
+    Shapes: `direction` (3,).
     """
     start = phantom.parent.at(np.array([abscissa_mm]))[0]
     unit = np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
@@ -383,18 +330,7 @@ def spline(knots_mm: Floats, *, vertical_ends: bool = False) -> Floats:
 
 
 def outer_side(axis: Centerline, i: int) -> Floats:
-    """Return the direction away from the center of curvature of an axis.
-
-    Parameters
-    ----------
-    axis : the axis.
-    i : index of the point.
-
-    Returns
-    -------
-    Floats
-        (3,) unit vector; any vector perpendicular to a straight axis.
-    """
+    """Return the direction away from the center of curvature of an axis."""
     span = max(1, min(25, i, len(axis.points_mm) - 1 - i))
     bend = axis.points_mm[i - span] - 2 * axis.points_mm[i] + axis.points_mm[i + span]
     length = float(np.linalg.norm(bend))
@@ -407,13 +343,7 @@ def outer_side(axis: Centerline, i: int) -> Floats:
 
 
 def phantom_surface(phantom: Phantom, *, edge_mm: float = 0.25) -> Surface:
-    """Return triangles on the exact wall, open and cut at a right angle at every end.
-
-    Parameters
-    ----------
-    phantom : the phantom.
-    edge_mm : approximate length of the edges.
-    """
+    """Return triangles on the exact wall, open and cut at a right angle at every end."""
     low, high = _box(phantom, margin_mm=4 * edge_mm)
     low, high = low - 3 * edge_mm, high + 3 * edge_mm
     ticks = [np.arange(a, b + edge_mm, edge_mm) for a, b in zip(low, high, strict=True)]

@@ -44,10 +44,7 @@ def similar(sizes: NDArray[Any]) -> list[int]:
 def bulging(sizes: NDArray[Any], prominence_of: Callable[[int], float]) -> int:
     """Return the number of the piece to keep: the largest of those with a bulge, or the largest of all.
 
-    Parameters
-    ----------
-    sizes : (n,) sizes of the pieces.
-    prominence_of : returns the `prominence` of a piece.
+    Shapes: `sizes` (n,).
     """
     pieces = similar(sizes)
     found = (k for k in pieces if len(pieces) > 1 and prominence_of(k) >= BULGING)
@@ -61,10 +58,7 @@ def prominence(inside: Bools, spacing_mm: Floats) -> float:
     to that of the narrowest passage that leads out of it. The sphere of an artery has others of similar radius before
     and behind it.
 
-    Parameters
-    ----------
-    inside : (i, j, k) whether a voxel is in the vessel.
-    spacing_mm : (3,) voxel edges.
+    Shapes: `inside` (i, j, k), `spacing_mm` (3,).
     """
     stride = max(1, int(np.ceil((inside.size / MOST_VOXELS) ** (1 / 3))))
     inside, spacing_mm = inside[::stride, ::stride, ::stride], spacing_mm * stride

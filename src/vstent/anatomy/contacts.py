@@ -82,15 +82,7 @@ class Contact(NamedTuple):
 def find_contact(path_mm: Floats, radius_mm: Floats, spheres: Medial) -> Contact | None:
     """Find the narrowest window between two arteries on a path.
 
-    Parameters
-    ----------
-    path_mm : (n, 3) points of the path in mm, along the medial axis of the lumen.
-    radius_mm : (n,) inscribed radii in mm.
-    spheres : inscribed spheres of the lumen.
-
-    Returns
-    -------
-    contact : None where the path crosses no window.
+    Shapes: `path_mm` (n, 3), `radius_mm` (n,).
     """
     place = curves.arc_length(path_mm)
     even = np.arange(0.0, place[-1], STEP_MM)
@@ -153,10 +145,7 @@ def part(vessel: Vessel, contact: Contact, *, holds_inlet: bool) -> Vessel | Non
     contact : window between the arteries.
     holds_inlet : where the vessel falls into two parts, keep the part with the inlet; otherwise keep the larger part.
 
-    Returns
-    -------
-    vessel : vessel without centerlines, with a note on the cut. None where no clean cut exists, or where the cut would
-        leave fewer than two openings, remove an inlet, or remove a part fed through a window that is not small.
+    Returns leave fewer than two openings, remove an inlet, or remove a part fed through a window that is not small.
     """
     lumen = vessel.lumen
     ring = _ring(lumen, contact)

@@ -45,10 +45,8 @@ def continued(anatomy: Anatomy) -> Anatomy:
     ----------
     anatomy : restored parent artery.
 
-    Returns
-    -------
-    anatomy : the same object where both ends are far enough from the neck, or from the middle of an artery without one.
-        Otherwise abscissae count from the continued proximal end, and `continued_mm` tells the lengths that were added.
+    Returns otherwise abscissae count from the continued proximal end, and `continued_mm` tells the lengths that were
+    added.
     """
     first_mm, last_mm = neck_span_mm(anatomy)
     spare_mm = first_mm, anatomy.parent.axis.length_mm - last_mm

@@ -48,10 +48,6 @@ def landing_diameters_mm(anatomy: Anatomy) -> tuple[float, float]:
     Parameters
     ----------
     anatomy : restored parent artery.
-
-    Returns
-    -------
-    proximal_mm, distal_mm : mean diameter of each zone in mm.
     """
     proximal_mm, distal_mm = neck_span_mm(anatomy)
     first_mm, last_mm = anatomy.parent.own_mm

@@ -56,15 +56,6 @@ def open_ends(vessel: Vessel) -> tuple[Vessel, medial.Medial]:
 
     The widest end is the inlet. The outlets are numbered from the widest to the narrowest.
 
-    Parameters
-    ----------
-    vessel : vessel without openings.
-
-    Returns
-    -------
-    vessel : vessel with openings.
-    spheres : inscribed spheres of its lumen.
-
     Raises
     ------
     VesselError
@@ -124,10 +115,7 @@ def opening_at(vessel: Vessel, point_mm: Floats) -> Opening:
 def with_inlets(vessel: Vessel, inlets_mm: Floats) -> Vessel:
     """Return the vessel with the openings at given points as its inlets, with a note on each distant point.
 
-    Parameters
-    ----------
-    vessel : vessel with openings.
-    inlets_mm : (k, 3) points in mm, see `opening_at`; the first one is where the parent artery begins.
+    Shapes: `inlets_mm` (k, 3).
 
     Raises
     ------
@@ -162,12 +150,7 @@ def _refuse_twice(inlets: Sequence[Opening], inlets_mm: Floats) -> None:
 
 
 def guessed(vessel: Vessel) -> Vessel:
-    """Return the vessel with a note if an outlet is nearly as wide as its automatically chosen inlet.
-
-    Parameters
-    ----------
-    vessel : vessel whose inlet is its widest opening.
-    """
+    """Return the vessel with a note if an outlet is nearly as wide as its automatically chosen inlet."""
     # The note gives the position of the outlet, because its number changes when ends are trimmed.
     widest = vessel.outlets[0]
     if widest.diameter_mm <= NEARLY * vessel.inlet.diameter_mm:
@@ -194,14 +177,6 @@ def still_open(vessel: Vessel) -> Vessel | None:
     """Return the vessel with those of its openings that its lumen still has.
 
     If all inlets are gone, the widest remaining opening is the inlet.
-
-    Parameters
-    ----------
-    vessel : vessel with openings, some of which its lumen may have lost.
-
-    Returns
-    -------
-    vessel : vessel without centerlines; None if fewer than two openings, or no outlet, remain.
     """
     tree = cKDTree(vessel.lumen.loop_centers_mm) if len(vessel.lumen.boundary_loops) else None
     left = [o for o in vessel.openings if tree is not None and tree.query(o.center_mm)[0] < STILL * o.diameter_mm]
@@ -320,17 +295,7 @@ def cut_square(
 ) -> Surface | None:
     """Cut off the wall beyond a plane, where it is connected to the section at a given center.
 
-    Parameters
-    ----------
-    lumen : wall of the vessel.
-    center_mm : (3,) point of the plane in mm.
-    direction : (3,) unit normal of the plane, away from the part that is kept.
-    radius_mm : radius of the vessel there in mm.
-    most : largest fraction of the wall that may be removed.
-
-    Returns
-    -------
-    lumen : remaining wall; None where nothing is cut.
+    Shapes: `center_mm` (3,), `direction` (3,).
     """
     height = (lumen.vertices_mm - center_mm) @ direction
     distance = np.linalg.norm(lumen.vertices_mm - center_mm, axis=1)

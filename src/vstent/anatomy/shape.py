@@ -35,11 +35,7 @@ class Beyond(NamedTuple):
 def beyond_plane(aneurysm: Aneurysm, center_mm: Floats, normal: Floats) -> Beyond:
     """Cut a sac by a plane and measure the part beyond.
 
-    Parameters
-    ----------
-    aneurysm : the sac, closed by its neck.
-    center_mm : (3,) point of the plane.
-    normal : (3,) unit normal, toward the dome.
+    Shapes: `center_mm` (3,), `normal` (3,).
     """
     sac = aneurysm.sac
     if np.abs((aneurysm.neck.corners_mm - center_mm) @ normal).max() < ON_PLANE_MM:

@@ -50,15 +50,7 @@ arteries have less."""
 def along_arms(graph: medial.Medial, paths: Sequence[Ints], radius_cap: Floats) -> list[Ints]:
     """Correct each path to follow both arms of a fork where it cuts through the crotch between them.
 
-    Parameters
-    ----------
-    graph : medial graph.
-    paths : vertices (k,) of each path of shortest travel time from the inlet to an outlet.
-    radius_cap : (n,) limit of the travel speed.
-
-    Returns
-    -------
-    paths : corrected paths, in the same order.
+    Shapes: `paths` (k,), `radius_cap` (n,).
     """
     times, led = medial.cost_graph(graph, radius_cap), []
     for path in paths:
@@ -74,16 +66,7 @@ def along_arms(graph: medial.Medial, paths: Sequence[Ints], radius_cap: Floats) 
 def around_sacs(graph: medial.Medial, path: Ints, speed_cap: float) -> tuple[Ints, list[str]]:
     """Correct a path to follow the artery around each sac that it runs through, where there is one.
 
-    Parameters
-    ----------
-    graph : medial graph.
-    path : (k,) vertices of the path of shortest travel time.
-    speed_cap : limit of the travel speed, in radii of the artery.
-
-    Returns
-    -------
-    path : corrected path.
-    notes : one sentence on each sac.
+    Shapes: `path` (k,).
     """
     points, artery_mm = _artery_along(graph, path)
     tree = cKDTree(points)

@@ -101,10 +101,7 @@ def parent_radius_mm(abscissa_mm: Floats, radius_mm: Floats) -> Floats:
 
     The result is a running percentile of the inscribed radii over `PARENT_WINDOW_MM`.
 
-    Parameters
-    ----------
-    abscissa_mm : (n,) evenly spaced arc lengths in mm.
-    radius_mm : (n,) inscribed radii in mm.
+    Shapes: `abscissa_mm` (n,), `radius_mm` (n,).
     """
     step = float(abscissa_mm[-1]) / max(len(abscissa_mm) - 1, 1)
     return curves.running_percentile(radius_mm, PARENT_PERCENTILE, round(PARENT_WINDOW_MM / step))

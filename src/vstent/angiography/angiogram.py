@@ -129,10 +129,7 @@ def entering(bolus: Bolus, field: FlowField) -> tuple[OverTime, float]:
 
     Parameters
     ----------
-    bolus : Bolus
-        The injection.
-    field : FlowField
-        The flow, steady or pulsatile.
+    field : the flow, steady or pulsatile.
     """
     if len(field.phases) < 2:
         return bolus.inflow([field.inflow_mL_s])
@@ -142,15 +139,6 @@ def entering(bolus: Bolus, field: FlowField) -> tuple[OverTime, float]:
 
 def injection(case: FlowCase, field: FlowField, settings: AngiogramSettings) -> Injection:
     """Prepare an injection into a flow.
-
-    Parameters
-    ----------
-    case : FlowCase
-        The flow case.
-    field : FlowField
-        Its flow.
-    settings : AngiogramSettings
-        Settings.
 
     Raises
     ------

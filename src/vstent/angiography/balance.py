@@ -63,14 +63,7 @@ class Balancer:
     def __call__(self, flux: Floats, source: Floats, guess: Floats | None = None) -> tuple[Floats, Floats]:
         """Return the corrected flow rates (f,) and the potential (n,) of the correction.
 
-        Parameters
-        ----------
-        flux : (f,) float
-            Flow rate to the upper side of each face.
-        source : (n,) float
-            Flow rate into each cell through openings; its sum is 0.
-        guess : (n,) float, optional
-            First guess of the potential.
+        Shapes: `flux` (f,), `source` (n,), `guess` (n,).
 
         Raises
         ------
@@ -99,12 +92,7 @@ class Balancer:
 def balancer(cells: Ints, left: Ints, right: Ints) -> Balancer:
     """Build the solver for connected cells.
 
-    Parameters
-    ----------
-    cells : (n, 3) int
-        Grid coordinates.
-    left, right : (f,) int
-        Cells on both sides of each face.
+    Shapes: `cells` (n, 3), `left, right` (f,).
     """
     n, ones = len(cells), np.ones(len(left))
     degree = np.bincount(left, minlength=n) + np.bincount(right, minlength=n)

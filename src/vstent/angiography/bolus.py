@@ -87,12 +87,9 @@ class Bolus:
 
         Parameters
         ----------
-        flow_mL_s : (p,)
-            Flow rate through the inlets; several values of a cycle are linear in between.
-        time_s : (p,)
-            Their times.
-        period_s : float, optional
-            Length of the cycle; none for a steady flow.
+        flow_mL_s : (p,); flow rate through the inlets; several values of a cycle are linear in between.
+        time_s : (p,); their times.
+        period_s : length of the cycle; none for a steady flow.
         """
         if self.curve:
             times, values = np.array(self.curve, dtype=np.float64).T

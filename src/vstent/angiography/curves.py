@@ -64,11 +64,6 @@ def retention_s(curves: Curves) -> tuple[float, bool] | None:
 
     The sac may keep more than half of its peak to the end of the curve; the retention is then at least the time from
     there to the end.
-
-    Parameters
-    ----------
-    curves : Curves
-        The curves.
     """
     parent_s, sac_s = (_falls_s(curves.time_s, one) for one in (curves.parent_mg_mL, curves.sac_mg_mL))
     if parent_s is None or curves.sac_mg_mL.max() <= 0:

@@ -43,12 +43,7 @@ def grid_of(case: FlowCase, field: FlowField, *, is_preview: bool) -> Grid:
 
     Parameters
     ----------
-    case : FlowCase
-        The flow case.
-    field : FlowField
-        Its flow.
-    is_preview : bool
-        Whether all cells are twice as wide.
+    is_preview : whether all cells are twice as wide.
 
     Raises
     ------

@@ -53,10 +53,8 @@ def layout(network: Network, diffusivity_mm2_s: float) -> Layout:
 
     Parameters
     ----------
-    network : Network
-        Cells and flow rates.
-    diffusivity_mm2_s : float
-        Molecular diffusivity of the contrast agent.
+    network : cells and flow rates.
+    diffusivity_mm2_s : molecular diffusivity of the contrast agent.
     """
     exchange_mm3_s = diffusivity_mm2_s * _conductance_mm(network)
     n = len(network.cells)

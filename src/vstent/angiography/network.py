@@ -181,10 +181,7 @@ def network(case: FlowCase, field: FlowField) -> Network:
 
     Parameters
     ----------
-    case : FlowCase
-        The flow case.
-    field : FlowField
-        Its flow, steady or pulsatile.
+    field : its flow, steady or pulsatile.
 
     Raises
     ------

@@ -32,11 +32,7 @@ def projector_of(view: View, points_mm: NDArray[np.floating[Any]], spacing_mm: N
     with magnification squared over the cosine between the ray and the axis of the beam. The idea of footprints is that
     of Long, Fessler & Balter 2010 (IEEE Trans. Med. Imaging 29:1839).
 
-    Parameters
-    ----------
-    view : direction, distances and detector.
-    points_mm : (n, 3) cell centers in LPS.
-    spacing_mm : (n,) edges of the cells, which are parallel to the axes of LPS.
+    Shapes: `points_mm` (n, 3), `spacing_mm` (n,).
 
     Raises
     ------

@@ -90,10 +90,8 @@ class Transport:
 
         Parameters
         ----------
-        interval_s : float
-            Time between frames.
-        end_s : float
-            Time of the last frame; the iteration may be stopped before.
+        interval_s : time between frames.
+        end_s : time of the last frame; the iteration may be stopped before.
         """
         top = self._laid.top
         marches = int(np.ceil(interval_s / (self.fastest_s * (1 << top)) - 1e-9))

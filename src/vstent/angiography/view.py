@@ -86,16 +86,7 @@ class View:
     def pixels_of(self, points_mm: Floats) -> tuple[Floats, Floats]:
         """Project points.
 
-        Parameters
-        ----------
-        points_mm : (n, 3) points.
-
-        Returns
-        -------
-        pixels : Floats
-            (n, 2) row and column, with pixel centers at integers.
-        magnification : Floats
-            (n,) magnification of a plane parallel to the detector through each point.
+        Shapes: `points_mm` (n, 3).
 
         Raises
         ------

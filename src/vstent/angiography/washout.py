@@ -60,18 +60,7 @@ def wash_out(
 ) -> Washout:
     """March the washout of a sac.
 
-    Parameters
-    ----------
-    network : Network
-        The sac and its surroundings.
-    sac : (s,) int
-        Cells of the sac.
-    end_s : float
-        Time after which the march stops; it stops earlier when hardly any of the blood is left.
-    diffusivity_mm2_s : float
-        Molecular diffusivity.
-    told : callable, optional
-        Called with the finished fraction.
+    Shapes: `sac` (s,).
     """
     first = np.zeros(len(network.cells))
     first[sac] = 1.0

@@ -138,14 +138,7 @@ def failures(state: State) -> dict[str, str]:
 
 
 def statuses(state: State, at_work: str, lost: Set[str]) -> dict[str, Status]:
-    """Return the status of every step.
-
-    Parameters
-    ----------
-    state : state of the case.
-    at_work : step of the running job; empty: none.
-    lost : steps whose results are missing.
-    """
+    """Return the status of every step."""
     keys, failed = dependencies(state), failures(state)
 
     def status(step: str) -> Status:
@@ -217,11 +210,6 @@ class Case:
 
     def step_back(self, revision: int, *, forward: bool = False) -> State:
         """Undo the last change, or redo the last undone one.
-
-        Parameters
-        ----------
-        revision : revision that the client last read.
-        forward : redo instead of undo.
 
         Raises
         ------

@@ -223,11 +223,6 @@ class Desk:
     def prepare_preview(self, case: Case) -> bool:
         """Begin to compute the live flow without a device, so that numbers follow soon when it is switched on.
 
-        Returns
-        -------
-        bool
-            Whether it was begun: not during a job, beside a live flow that is watched, or where memory is short.
-
         Raises
         ------
         InputError
@@ -284,16 +279,7 @@ class Desk:
             return found
 
     def outlines(self, case: Case, treatment: str | None, axis: int, index: int, *, is_upright: bool = False) -> bytes:
-        """Return the outlines on a slice as a message for the page.
-
-        Parameters
-        ----------
-        case : the case.
-        treatment : chosen treatment whose wires are cut; None: none.
-        axis : voxel axis across the slice.
-        index : voxel index along that axis.
-        is_upright : whether the slice is an anatomical plane of an oblique scan.
-        """
+        """Return the outlines on a slice as a message for the page."""
         from vstent.app.outlines import outlines
 
         live = self.live(case)

@@ -53,16 +53,7 @@ def films_message(
     moment: int | None = None,
     **more: Any,
 ) -> bytes:
-    """Return the films of all flows along one direction, as a message for the page.
-
-    Parameters
-    ----------
-    histories : contrast by name, ``bare`` first.
-    angles_rad : primary and secondary angle.
-    stents : implants whose wires are shown, by treatment.
-    moment : number of the only frame to return, with coarse pixels; None: all frames.
-    more : further entries of the manifest.
-    """
+    """Return the films of all flows along one direction, as a message for the page."""
     settings = FilmSettings(angles_rad, pixel_mm=PIXEL_MM if moment is None else QUICK_PIXEL_MM)
     view = view_for(histories, settings)
     packer, panes, times_s = Packer(), [], np.zeros(0)

@@ -16,13 +16,7 @@ FACES: Final = 40_000
 
 
 def read_layer(path: Path, choices: Choices) -> bytes:
-    """Return a surface file as a message for the page.
-
-    Parameters
-    ----------
-    path : the file.
-    choices : length unit and frame as chosen.
-    """
+    """Return a surface file as a message for the page."""
     surface = thin_surface(read_surface(path, units=choices.units, frame=choices.frame)[0], FACES)[0]
     layer = MeshLayer("input", "", (0.62, 0.68, 0.73), "", np.zeros(0), surface)
     return message([layer], views=[view_of("whole", FRONTAL, surface.vertices_mm)])

@@ -292,11 +292,7 @@ class Live:
     def neck_message(self, curve_mm: Floats, handle: int | None, to_mm: Floats | None) -> bytes:
         """Return a neck with its area, optionally with one handle moved to a point of the wall.
 
-        Parameters
-        ----------
-        curve_mm : (n, 3) points of the neck.
-        handle : number of the handle to move; None: none.
-        to_mm : (3,) new position of the handle.
+        Shapes: `curve_mm` (n, 3), `to_mm` (3,).
         """
         with LOCK:
             if handle is not None and to_mm is not None:
@@ -327,15 +323,7 @@ class Live:
         return self.remembered(("proposed", self.case.state.anatomy, *devices), find)
 
     def sketch_message(self, treatment: Treatment, implant: str, landing: Landing | None, colour: Colour) -> bytes:
-        """Return the wires of an implant at its expected position, with the others of its treatment as deployed.
-
-        Parameters
-        ----------
-        treatment : the treatment.
-        implant : id of the implant.
-        landing : its position; None: the chosen or proposed one.
-        colour : quantity that colors the wires.
-        """
+        """Return the wires of an implant at its expected position, with the others of its treatment as deployed."""
         with LOCK:
             pane, found = treatment.name, self.sketch(_one(treatment, implant), landing)
             others = {one.id: self.deployment(treatment, one).stent for one in treatment.implants if one.id != implant}
@@ -346,14 +334,7 @@ class Live:
             return message(layers, scales_of(layers, self.anatomy), treatment=pane, implant=implant, **place)
 
     def deployment_message(self, treatment: Treatment, implant: str, colour: Colour) -> bytes:
-        """Return a deployed treatment with its expansion and its metrics, and the place of one of its implants.
-
-        Parameters
-        ----------
-        treatment : the treatment.
-        implant : id of the implant.
-        colour : quantity that colors the wires.
-        """
+        """Return a deployed treatment with its expansion and its metrics, and the place of one of its implants."""
         with LOCK:
             one, deployed = _one(treatment, implant), self.deployed(treatment)
             stent = deployed[implant].stent
@@ -373,13 +354,7 @@ class Live:
             )
 
     def comparison_message(self, treatments: Sequence[Treatment], colour: Colour) -> bytes:
-        """Return several deployed treatments, each in a pane of its own, on common color scales.
-
-        Parameters
-        ----------
-        treatments : the treatments, in the order of the panes ``compared 0``, ``compared 1`` and so on.
-        colour : quantity that colors the wires.
-        """
+        """Return several deployed treatments, each in a pane of its own, on common color scales."""
         with LOCK:
             layers: list[MeshLayer | LineLayer] = []
             told = []
@@ -391,10 +366,6 @@ class Live:
 
     def flow_message(self, moment: int | None) -> bytes:
         """Return wall shear stress, streamlines and a cut of every flow, on common color scales.
-
-        Parameters
-        ----------
-        moment : number of the moment in the last cycle; None: the mean.
 
         Raises
         ------
@@ -413,12 +384,6 @@ class Live:
 
     def films_message(self, direction: str, *, has_wires: bool = False, moment: int | None = None) -> bytes:
         """Return the films of every flow along one direction.
-
-        Parameters
-        ----------
-        direction : C-arm direction in words; empty: the working projection.
-        has_wires : whether the wires of the devices are shown.
-        moment : number of the only frame to return; None: all frames.
 
         Raises
         ------

@@ -38,10 +38,7 @@ def pulled(anatomy: Anatomy, curve_mm: Floats, handle: int, to_mm: Floats) -> Fl
     handle : number of the handle.
     to_mm : (3,) new position of the handle.
 
-    Returns
-    -------
-    Floats
-        (n, 3) points of the new neck.
+    Returns (n, 3) points of the new neck.
     """
     at = round(handle * len(curve_mm) / NECK_HANDLES)
     away = (np.arange(len(curve_mm)) - at + len(curve_mm) / 2) % len(curve_mm) - len(curve_mm) / 2

@@ -20,14 +20,6 @@ def outlines(image: Image | Grid, anatomy: Anatomy, stents: Sequence[Stent], axi
 
     Positions are voxel indices (column, row) in the slice. Surfaces give segments, wires give the points where their
     axis crosses the plane.
-
-    Parameters
-    ----------
-    image : the scan, or another grid of its slices.
-    anatomy : vessel, parent artery and sacs.
-    stents : devices with wires.
-    axis : voxel axis across the slice: 0, 1 or 2.
-    index : voxel index along that axis.
     """
     packer = Packer()
     curves = {

@@ -48,12 +48,7 @@ def is_oblique(image: Image) -> bool:
 
 
 def upright(image: Image) -> Grid:
-    """Return the grid along the axes of the patient that holds a scan; its spacing is that of the nearest voxel axes.
-
-    Parameters
-    ----------
-    image : the scan.
-    """
+    """Return the grid along the axes of the patient that holds a scan; the spacing is that of the nearest axes."""
     ends = np.array(list(product(*((0.0, n - 1.0) for n in image.voxels.shape))))
     corners_mm = image.to_mm(ends)
     nearest = np.abs(image.affine_mm[:3, :3] / image.spacing_mm).argmax(axis=1)
@@ -66,15 +61,7 @@ def upright(image: Image) -> Grid:
 
 
 def reformatted(image: Image, grid: Grid, axis: int, first: int, last: int) -> Any:
-    """Return the largest interpolated intensities of slices of a grid, columns first; the lowest outside the scan.
-
-    Parameters
-    ----------
-    image : the scan.
-    grid : grid along the axes of the patient.
-    axis : axis of the grid across the slices.
-    first, last : indices of the first slice, and of the one after the last.
-    """
+    """Return the largest interpolated intensities of slices of a grid, columns first; the lowest outside the scan."""
     from scipy.ndimage import affine_transform
 
     shape = list(grid.shape)

@@ -45,11 +45,6 @@ def rank_sizes(case: Case, progress: OnProgress) -> None:
 
     The ranking by geometry is stored before the first flow. Finished flows are kept, so that a stopped ranking goes on.
 
-    Parameters
-    ----------
-    case : the case.
-    progress : called at every stage.
-
     Raises
     ------
     InputError

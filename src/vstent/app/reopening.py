@@ -21,11 +21,6 @@ def stem(path: Path) -> str:
 def reopened(store: Store, folder: Path) -> Case:
     """Create a case from the folder of a study.
 
-    Parameters
-    ----------
-    store : cases of the page.
-    folder : the case folder.
-
     Raises
     ------
     ReadError

@@ -35,10 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     ----------
     argv : arguments; None: those of the process.
 
-    Returns
-    -------
-    int
-        Exit code: 0 done, 1 failed, 2 input cannot be used, 130 interrupted.
+    Returns exit code: 0 done, 1 failed, 2 input cannot be used, 130 interrupted.
     """
     # The linear systems are too small for several threads of the linear algebra library.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

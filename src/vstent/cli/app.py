@@ -80,13 +80,7 @@ def _listen(host: str, port: int) -> socket.socket:
 
 
 def open_desk(given: Path | None, workspace: Path) -> "Desk":
-    """Return a desk with its cases.
-
-    Parameters
-    ----------
-    given : scan, surface or case folder to open; None: nothing is opened.
-    workspace : folder of the cases.
-    """
+    """Return a desk with its cases."""
     from vstent.app.cases import Store
     from vstent.app.desk import Desk
 

@@ -210,13 +210,7 @@ FLOW_COLUMNS: Final = (
 
 
 def ranking_table(ranking: Ranking, shown: int) -> Table:
-    """Return the table of the best candidates of a ranking.
-
-    Parameters
-    ----------
-    ranking : the ranking.
-    shown : number of candidates to show.
-    """
+    """Return the table of the best candidates of a ranking."""
     has_flow = any("flow_grade" in candidate.measures for candidate in ranking.candidates)
     columns = RANKING_COLUMNS + tuple(
         one for one in FLOW_COLUMNS * has_flow if any(one[1] in candidate.measures for candidate in ranking.candidates)
@@ -244,13 +238,7 @@ def _length_band(measures: Mapping[str, Any]) -> str:
 
 
 def ranking_reasons(ranking: Ranking, shown: int) -> str:
-    """Return one line per candidate with the reasons for its rank.
-
-    Parameters
-    ----------
-    ranking : the ranking.
-    shown : number of candidates to show.
-    """
+    """Return one line per candidate with the reasons for its rank."""
     best = _shown(ranking, shown)
     return "\n".join(f"{number}. {candidate.label}: {candidate.reason}" for number, candidate in best)
 

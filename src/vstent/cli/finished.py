@@ -68,13 +68,6 @@ def remember(arguments: argparse.Namespace, before: Begun, told: Mapping[str, An
     """Store the record of a command that is finished.
 
     No record is stored where another process uses the folder, or has changed it since, or where it cannot be written.
-
-    Parameters
-    ----------
-    arguments : parsed options.
-    before : what its output depends on.
-    told : provenance of its results.
-    printed : what the command has printed.
     """
     from vstent.errors import FolderError
     from vstent.plugins import plugins

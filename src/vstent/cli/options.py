@@ -38,14 +38,7 @@ def readable(option: fields.Option) -> Callable[[str], Any]:
 
 
 def add_option(group: "argparse._ActionsContainer", option: fields.Option, **more: Any) -> None:
-    """Add an option, and the one that states its opposite.
-
-    Parameters
-    ----------
-    group : parser or group of options to which they are added.
-    option : the option.
-    more : further arguments of argparse, such as a default.
-    """
+    """Add an option, and the one that states its opposite."""
     about = f"{option.help}, {option.limits.unit}" if option.limits.unit else option.help
     about += f" (default: {option.usual})" if option.usual else ""
     about += "; repeat for several" if option.separators else ""
@@ -76,14 +69,7 @@ def add_number(
 
 
 def add_settings(parser: argparse.ArgumentParser, *sections: str, without: Container[str] = ()) -> None:
-    """Add the options of sections of the settings, each section a group of the help.
-
-    Parameters
-    ----------
-    parser : parser of the command.
-    sections : names of the sections.
-    without : names of options that the command does not have.
-    """
+    """Add the options of sections of the settings, each section a group of the help."""
     for section in sections:
         group = parser.add_argument_group(section)
         for name, option in in_section(section).items():
@@ -100,26 +86,12 @@ def given(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def given_settings(arguments: argparse.Namespace, **usual: Any) -> Settings:
-    """Return the settings that the options state.
-
-    Parameters
-    ----------
-    arguments : parsed options.
-    usual : values of options that are not given, by name.
-    """
+    """Return the settings that the options state."""
     return settings_of(usual | given(arguments))
 
 
 def add_command(commands: Commands, name: str, text: str, example: str) -> argparse.ArgumentParser:
-    """Add a command.
-
-    Parameters
-    ----------
-    commands : parser to which the command is added.
-    name : name of the command.
-    text : summary, one sentence.
-    example : arguments of an example, after ``vstent``.
-    """
+    """Add a command."""
     parser = commands.add_parser(
         name,
         help=text[0].lower() + text[1:].rstrip("."),
@@ -161,12 +133,6 @@ def add_crew(group: "argparse._ArgumentGroup") -> None:
 
 def given_crew(arguments: argparse.Namespace, jobs: int, memory_MB: float) -> "AbstractCrew":
     """Return the processes or the cluster that the options request.
-
-    Parameters
-    ----------
-    arguments : the parsed options.
-    jobs : number of parallel processes for which this machine's memory suffices.
-    memory_MB : estimated memory of one task; 0: unknown.
 
     Raises
     ------

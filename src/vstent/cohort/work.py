@@ -135,11 +135,6 @@ def flat_metrics(metrics: Mapping[str, Any], treatment: str) -> Row:
     """Return all metrics of a study that concern one treatment, under dotted keys.
 
     Measures of the implant of a treatment with one begin with ``implant``, those of several with ``implants.ID``.
-
-    Parameters
-    ----------
-    metrics : metrics of the study.
-    treatment : name of the treatment.
     """
     found = dict(metrics["treatments"][treatment])
     implants = found.pop("implants")
@@ -157,28 +152,14 @@ def _flat(values: Mapping[str, Any], before: str) -> Row:
 
 
 def write_row(task: Task, treatment: str, row: Row) -> None:
-    """Write the row of a treatment with the key of everything it depends on.
-
-    Parameters
-    ----------
-    task : task of the case.
-    treatment : name of the treatment.
-    row : values by column name.
-    """
+    """Write the row of a treatment with the key of everything it depends on."""
     named = {"case": task.case.name, "treatment": treatment} | row
     kept = {"key": task.keys[treatment], "row": named, "settings": asdict(task.case.settings)}
     write_json(row_path(task.folder, treatment), kept)
 
 
 def read_row(folder: Path, treatment: str, key: str) -> Row | None:
-    """Return the row of a treatment; None where it is missing, damaged, or has another key.
-
-    Parameters
-    ----------
-    folder : folder of the case.
-    treatment : name of the treatment.
-    key : key of everything that the row depends on.
-    """
+    """Return the row of a treatment; None where it is missing, damaged, or has another key."""
     try:
         kept = json.loads(row_path(folder, treatment).read_text(encoding="utf-8"))
         return dict(kept["row"]) if kept["key"] == key else None

@@ -95,15 +95,10 @@ class State:
 
         Parameters
         ----------
-        centers_mm : (rows, columns, 3) array, mm
-            New fiducial points inside the lumen.
-        rows : (rows, columns) array of int
-            Row of this contour whose fiducial point is near each new one.
+        centers_mm : (rows, columns, 3), mm; new fiducial points inside the lumen.
+        rows : (rows, columns); row of this contour whose fiducial point is near each new one.
 
-        Returns
-        -------
-        State
-            The contour with the new fiducial points.
+        Returns the contour with the new fiducial points.
         """
         off_mm = curves.lengths(centers_mm - self.centers_mm[rows, 0])
         return replace(self, centers_mm=centers_mm, clearance_mm=np.maximum(self.clearance_mm[rows, 0] - off_mm, 0.0))
@@ -115,17 +110,11 @@ class State:
 
         Parameters
         ----------
-        points_mm : (n, 3) array, mm
-            The points.
-        centers_mm : (n, 3) array, mm
-            Their fiducial points.
-        rows, columns : (n,) array of int
-            The node near each point.
+        points_mm : (n, 3), mm; the points.
+        centers_mm : (n, 3), mm; their fiducial points.
+        rows, columns : (n,); the node near each point.
 
-        Returns
-        -------
-        State
-            Contour of n rows and one column.
+        Returns contour of n rows and one column.
         """
         number = rows * self.nodes_mm.shape[1] + columns
         return replace(
@@ -193,19 +182,12 @@ class ActiveContour:
 
         Parameters
         ----------
-        nodes_mm : (rows, columns, 3) array, mm
-            Nodes of the closed contour.
-        centers_mm : (rows, 3) array, mm
-            Centers of the rows, inside the lumen.
-        clearance_mm : (rows,) array, mm
-            Distances from the centers to the wall.
-        wall : AbstractWall
-            Wall of the artery.
+        nodes_mm : (rows, columns, 3), mm; nodes of the closed contour.
+        centers_mm : (rows, 3), mm; centers of the rows, inside the lumen.
+        clearance_mm : (rows,), mm; distances from the centers to the wall.
+        wall : wall of the artery.
 
-        Returns
-        -------
-        State
-            The contour, with no node terminated.
+        Returns the contour, with no node terminated.
         """
         shape = nodes_mm.shape
         return State(
@@ -292,19 +274,7 @@ class ActiveContour:
     def relocated_mm(self, points_mm: Floats, is_outside: Bools, contact: Contact) -> Floats:
         """Return points (n, 3) moved to the distance dd from their closest wall points, into the lumen, eq. (6, 7).
 
-        Parameters
-        ----------
-        points_mm : (n, 3) array, mm
-            The points.
-        is_outside : (n,) array of bool
-            Points outside the lumen, for which eq. (7) applies.
-        contact : Contact
-            Their nearest wall.
-
-        Returns
-        -------
-        (n, 3) array, mm
-            Points at the distance dd from the wall.
+        Shapes: `points_mm` (n, 3), `is_outside` (n,).
         """
         away = contact.inward(points_mm)
         side = np.where(is_outside & (contact.distance_mm > ON_WALL_MM), -1.0, 1.0)

@@ -43,25 +43,7 @@ class Gaps(NamedTuple):
 
 
 def advise(anatomy: Anatomy, stent: Stent, course: Course, gaps: Gaps) -> str:
-    """Describe where the device lies and what to do if it does not fit.
-
-    Parameters
-    ----------
-    anatomy : Anatomy
-        The artery.
-    stent : Stent
-        The deployed device.
-    course : Course
-        Record of the deployment.
-    gaps : Gaps
-        Gaps between the device and the wall.
-
-    Returns
-    -------
-    str
-        One sentence, and further ones if cells are crumpled, if the device lies beyond the patient's artery and if the
-        neck is on a fork.
-    """
+    """Describe where the device lies and what to do if it does not fit."""
     lies = _lies(anatomy, stent, course, gaps)
     crumpled = _crumpled(anatomy, stent, remedy="" if lies.endswith(BRAIDED) else _remedy_of_crumpling(stent))
     return f"{lies}{crumpled}{_beyond_patient(anatomy, stent)}{_of_fork(anatomy)}"

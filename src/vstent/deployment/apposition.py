@@ -13,19 +13,9 @@ from vstent.kernels.arrays import Floats
 def apposition(anatomy: Anatomy, deployment: Deployment) -> Measures:
     """Measure the gaps to the patient's own wall, and how far nodes lie outside the landing surface.
 
-    Parameters
-    ----------
-    anatomy : Anatomy
-        The artery.
-    deployment : Deployment
-        The deployed device.
-
-    Returns
-    -------
-    dict
-        Apposed fraction of the nodes, mean and largest gap (mm), volume between device and wall (mm3), and largest
-        distance of a node outside the landing surface (mm). Only the last is given where the whole device lies over
-        restored wall.
+    Returns apposed fraction of the nodes, mean and largest gap (mm), volume between device and wall (mm3), and largest
+    distance of a node outside the landing surface (mm). Only the last is given where the whole device lies over
+    restored wall.
     """
     stent = deployment.stent
     points_mm = stent.nodes_mm.reshape(-1, 3)

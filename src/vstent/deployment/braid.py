@@ -60,15 +60,10 @@ class Profile:
 
         Parameters
         ----------
-        abscissa_mm : (r,) array, mm
-            Increasing arc lengths of the measurements.
-        diameter_mm : (r,) array, mm
-            Measured diameters.
+        abscissa_mm : (r,), mm; increasing arc lengths of the measurements.
+        diameter_mm : (r,), mm; measured diameters.
 
-        Returns
-        -------
-        Profile
-            Profile through the measurements. Beyond them it keeps its shape, shifted to meet the outermost ones.
+        Returns profile through the measurements. Beyond them it keeps its shape, shifted to meet the outermost ones.
         """
         error_mm = np.interp(self.abscissa_mm, abscissa_mm, diameter_mm - self.at(abscissa_mm))
         outside = (self.abscissa_mm < abscissa_mm[0]) | (self.abscissa_mm > abscissa_mm[-1])
@@ -88,19 +83,7 @@ def expected_profile(design: Design, size: Size, anatomy: Anatomy) -> Profile:
     cells leave the wall, and its rows do not come as close together as those of a braid. `vstent.deployment.cells` then
     moves them.
 
-    Parameters
-    ----------
-    design : Design
-        The device.
-    size : Size
-        Its size.
-    anatomy : Anatomy
-        The artery.
-
-    Returns
-    -------
-    Profile
-        Expected diameter along the parent axis, with its curvature for a braid.
+    Returns expected diameter along the parent axis, with its curvature for a braid.
     """
     offset_mm = design.wall_offset_um * MM_PER_UM
     diameter_mm = np.minimum(2 * (anatomy.parent.section_radius_mm - offset_mm), widest_mm(design, size))
@@ -136,19 +119,11 @@ def march(design: Design, size: Size, landing: Landing, profile: Profile) -> Flo
 
     Parameters
     ----------
-    design : Design
-        The device.
-    size : Size
-        Its size.
-    landing : Landing
-        Where the proximal, middle or distal row lies.
-    profile : Profile
-        Diameter and curvature along the axis.
+    landing : where the proximal, middle or distal row lies.
+    profile : diameter and curvature along the axis.
 
-    Returns
-    -------
-    (rows,) array, mm
-        Arc lengths of the rows. They may lie beyond the artery, where the diameter is taken as that at its end.
+    Returns (rows,), mm: arc lengths of the rows. They may lie beyond the artery, where the diameter is taken as that
+    at its end.
     """
     rows_mm = _marched(design, size, landing, profile)
     if not size.free_profile_mm:
@@ -185,17 +160,7 @@ class FreeDiameter:
     def __call__(self, before_mm: Floats, after_mm: Floats) -> tuple[Floats, Bools]:
         """Move every row as far as its perimeter may grow.
 
-        Parameters
-        ----------
-        before_mm, after_mm : (rows, columns, d) array, mm
-            Nodes before and after an unlimited step.
-
-        Returns
-        -------
-        nodes_mm : (rows, columns, d) array, mm
-            Nodes after the limited step.
-        is_over : (rows, columns) array of bool
-            Nodes in rows that have reached the free perimeter.
+        Shapes: `before_mm, after_mm` (rows, columns, d).
         """
         allowed = np.pi * self.diameter_mm
         old, new = perimeters(before_mm), perimeters(after_mm)

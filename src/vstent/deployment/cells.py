@@ -128,27 +128,7 @@ def relax(
 ) -> Floats:
     """Compute the moves that restore the strut lengths of a laser-cut device.
 
-    Parameters
-    ----------
-    net : Net
-        Joints and struts on the wall, with c joints.
-    length_mm : float
-        Length of a strut as cut, in mm.
-    width_mm : (rows,) array, mm
-        Width of a cell of the free device on every row of joints.
-    joint_mm : float
-        Width of a joint, in mm.
-    held : float
-        Row of joints whose mean move along the device is held at zero. A fraction lies between two rows.
-    laid : callable
-        Puts points of the chart on the wall.
-    cut : Cut, optional
-        Free crowns of an open-cell device; None: all crowns are joined.
-
-    Returns
-    -------
-    (c, 3) array, mm
-        Moves of the joints along, around and off the wall (positive: into the lumen). With `cut`, of its joints.
+    Shapes: `width_mm` (rows,).
     """
     if cut is None:
         frame = _closed_frame(net, length_mm, width_mm, joint_mm, held, laid)

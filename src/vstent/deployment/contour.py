@@ -75,13 +75,9 @@ def planes(axis: Centerline) -> Planes:
 
     Parameters
     ----------
-    axis : Centerline
-        Axis of the parent artery.
+    axis : axis of the parent artery.
 
-    Returns
-    -------
-    Planes
-        Planes along the whole axis. The result is cached.
+    Returns planes along the whole axis. The result is cached.
     """
     n = max(8, round(axis.length_mm / STEP_MM) + 1)
     abscissa_mm = np.linspace(0.0, axis.length_mm, n)
@@ -136,13 +132,9 @@ def perimeters(nodes: Floats) -> Floats:
 
     Parameters
     ----------
-    nodes : (n, m, d) array
-        Nodes of n closed rows.
+    nodes : (n, m, d); nodes of n closed rows.
 
-    Returns
-    -------
-    (n,) array
-        Lengths, in the unit of the nodes.
+    Returns (n,): lengths, in the unit of the nodes.
     """
     m = nodes.shape[1]
     length = curves.closed_lengths(nodes)
@@ -156,15 +148,7 @@ def evenly_spaced(nodes: Floats) -> Floats:
 
     Each row is turned as little as possible and keeps its length.
 
-    Parameters
-    ----------
-    nodes : (n, m, d) array
-        Nodes of n closed rows.
-
-    Returns
-    -------
-    (n, m, d) array
-        Evenly spaced nodes.
+    Shapes: `nodes` (n, m, d).
     """
     n, m = nodes.shape[:2]
     closed = np.concatenate([nodes, nodes[:, :1]], axis=1)

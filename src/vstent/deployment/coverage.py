@@ -51,20 +51,6 @@ def pore_areas_mm2(stent: Stent) -> tuple[Floats, Floats, Floats]:
 
     Pores lie where the lattice has no junction. Each fills half of the four lattice cells around it. The wires of an
     outer layer do not divide them, and its ends without a mesh have none.
-
-    Parameters
-    ----------
-    stent : Stent
-        The deployed device.
-
-    Returns
-    -------
-    area_mm2 : (p,) array, mm2
-        Areas of the pores.
-    centers_mm : (p, 3) array, mm
-        Centers of the pores.
-    number : (p,) array
-        1; less by 0.5 for each free crown of open cells beside a pore, which leaves two of them joined.
     """
     shape = grid(stent.design, stent.size)
     lattice_mm = stent.nodes_mm[:: shape.row_split, :: shape.column_split]
@@ -85,18 +71,8 @@ def pore_areas_mm2(stent: Stent) -> tuple[Floats, Floats, Floats]:
 def density(anatomy: Anatomy, stent: Stent) -> Measures:
     """Measure metal coverage and pore density of the whole device and over the neck.
 
-    Parameters
-    ----------
-    anatomy : Anatomy
-        The artery.
-    stent : Stent
-        The deployed device.
-
-    Returns
-    -------
-    dict
-        Coverage (fraction) and pore density (1/mm2), with the closed formulas at the mean diameter. Those of the whole
-        device refer to its mesh. Numbers over the neck are left out where nothing of the device lies over it.
+    Returns coverage (fraction) and pore density (1/mm2), with the closed formulas at the mean diameter. Those of the
+    whole device refer to its mesh. Numbers over the neck are left out where nothing of the device lies over it.
     """
     quads_mm = 0.25 * (stent.nodes_mm[1:] + stent.nodes_mm[:-1])
     quads_mm = (quads_mm + np.roll(quads_mm, -1, axis=1)).reshape(-1, 3)
@@ -136,15 +112,9 @@ def is_over_neck(anatomy: Anatomy, points_mm: Floats) -> Bools:
 
     Parameters
     ----------
-    anatomy : Anatomy
-        The artery.
-    points_mm : (n, 3) array, mm
-        Points on the device.
+    points_mm : (n, 3), mm; points on the device.
 
-    Returns
-    -------
-    (n,) array of bool
-        Points where the landing surface closes or faces the neck.
+    Returns (n,): points where the landing surface closes or faces the neck.
     """
     neck = _neck_on_landing(anatomy)
     at_most_mm = anatomy.parent.landing_surface.closest(points_mm)[1] + NECK_TOLERANCE_MM

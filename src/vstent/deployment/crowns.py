@@ -56,20 +56,7 @@ class Split(NamedTuple):
 
 
 def free_crowns(design: LaserCut, shape: Grid) -> Bools:
-    """Return where on the lattice crowns are free.
-
-    Parameters
-    ----------
-    design : LaserCut
-        The device.
-    shape : Grid
-        Its grid.
-
-    Returns
-    -------
-    (lattice rows, lattice columns) array of bool
-        Free crowns; those on the first and the last row belong to one ring only and are not counted.
-    """
+    """Return where on the lattice crowns are free."""
     found = np.zeros((shape.lattice_rows, shape.lattice_columns), dtype=bool)
     for row in range(1, shape.lattice_rows - 1):
         columns = np.arange(row % 2, shape.lattice_columns, 2)
@@ -82,15 +69,10 @@ def split(net: Net, is_crossing_free: Bools) -> Split:
 
     Parameters
     ----------
-    net : Net
-        Net of the closed lattice, with c crossings.
-    is_crossing_free : (c,) array of bool
-        Crossings at which crowns are free.
+    net : net of the closed lattice, with c crossings.
+    is_crossing_free : (c,); crossings at which crowns are free.
 
-    Returns
-    -------
-    Split
-        The net with one joint for each joined and two for each free crown.
+    Returns the net with one joint for each joined and two for each free crown.
     """
     copies = 1 + is_crossing_free.astype(int)
     crossing = np.repeat(np.arange(len(copies)), copies)

@@ -48,17 +48,7 @@ class Cells(NamedTuple):
 def cells(stent: Stent, axis: Centerline) -> Cells:
     """Compute how wide the cells of a device are, seen from the axis of the artery.
 
-    Parameters
-    ----------
-    stent : Stent
-        The deployed device.
-    axis : Centerline
-        The parent axis.
-
-    Returns
-    -------
-    Cells
-        Width and place of every cell; empty where the device has no whole cell.
+    Returns width and place of every cell; empty where the device has no whole cell.
 
     Notes
     -----
@@ -120,20 +110,7 @@ class Crumpling(NamedTuple):
 
 @lru_cache(maxsize=8)  # a deployment is advised on and measured
 def crumpling(anatomy: Anatomy, stent: Stent) -> Crumpling | None:
-    """Find the narrowest cell of a device, and count the crumpled ones.
-
-    Parameters
-    ----------
-    anatomy : Anatomy
-        The artery.
-    stent : Stent
-        The deployed device.
-
-    Returns
-    -------
-    Crumpling or None
-        The narrowest cell and the number of crumpled cells; None where the device has no whole cell.
-    """
+    """Find the narrowest cell of a device, and count the crumpled ones."""
     found = cells(stent, anatomy.parent.axis)
     if not len(found.width_fraction):
         return None
@@ -148,15 +125,7 @@ def crumpling(anatomy: Anatomy, stent: Stent) -> Crumpling | None:
 
 
 def crumpling_measures(anatomy: Anatomy, stent: Stent) -> Measures:
-    """Return the smallest width of a cell, its place, and the number and fraction of crumpled cells; empty if none.
-
-    Parameters
-    ----------
-    anatomy : Anatomy
-        The artery.
-    stent : Stent
-        The deployed device.
-    """
+    """Return the smallest width of a cell, its place, and the number and fraction of crumpled cells; empty if none."""
     found = crumpling(anatomy, stent)
     if found is None:
         return {}
@@ -172,15 +141,7 @@ def crumpling_measures(anatomy: Anatomy, stent: Stent) -> Measures:
 
 
 def place_of_narrowest(anatomy: Anatomy, found: Crumpling) -> str:
-    """Say where the narrowest cell lies: its distance from the nearer end of the neck, and the side of the bend.
-
-    Parameters
-    ----------
-    anatomy : Anatomy
-        The artery.
-    found : Crumpling
-        The narrowest cell.
-    """
+    """Say where the narrowest cell lies: its distance from the nearer end of the neck, and the side of the bend."""
     side = _side(found.inward)
     if not anatomy.aneurysms:
         return f"at {found.abscissa_mm:.1f} mm along the parent artery{side}"

@@ -37,21 +37,6 @@ class Zhong2016(AbstractMethod):
 
 
 def evenly_spaced_rows(landing: Landing, length_mm: float, rows: int) -> Floats:
-    """Compute evenly spaced arc lengths for the rows of a device.
-
-    Parameters
-    ----------
-    landing : Landing
-        Where the device is landed.
-    length_mm : float
-        Length of the device, in mm.
-    rows : int
-        Number of rows.
-
-    Returns
-    -------
-    (rows,) array, mm
-        Arc lengths of the rows on the parent axis.
-    """
+    """Compute evenly spaced arc lengths for the rows of a device."""
     before_mm = {"proximal": 0.0, "center": 0.5 * length_mm, "distal": length_mm}[landing.anchor]
     return landing.abscissa_mm - before_mm + np.linspace(0.0, length_mm, rows)

@@ -87,18 +87,7 @@ def _position(anatomy: Anatomy, stent: Stent) -> Measures:
 
 
 def wire_stretches(stent: Stent) -> Floats:
-    """Return the relative elongation (p,) of every piece of wire or strut between junctions.
-
-    Parameters
-    ----------
-    stent : Stent
-        The deployed device.
-
-    Returns
-    -------
-    (p,) array
-        Length of each piece over its length as made, less one.
-    """
+    """Return the relative elongation (p,) of every piece of wire or strut between junctions."""
     shape = grid(stent.design, stent.size)
     junctions_mm = stent.nodes_mm[:: shape.row_split, :: shape.column_split]
     row, column = np.meshgrid(np.arange(shape.lattice_rows - 1), np.arange(shape.lattice_columns), indexing="ij")
@@ -144,16 +133,6 @@ def branch_abscissas_mm(anatomy: Anatomy) -> Floats:
     """Return the arc lengths (b,) on the parent axis, in mm, at which branches leave the parent artery.
 
     Centerlines that leave it at one place, within the radius of the branch, count as one branch.
-
-    Parameters
-    ----------
-    anatomy : Anatomy
-        The artery.
-
-    Returns
-    -------
-    (b,) array, mm
-        Arc lengths of the branches. The result is cached.
     """
     axis, left_mm = anatomy.parent.axis, []
     ostia_mm: list[Floats] = []

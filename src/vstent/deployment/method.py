@@ -63,17 +63,11 @@ class Placement:
 
         Parameters
         ----------
-        contour : ActiveContour
-            The active contour with its weights.
-        rows_mm : (rows,) array, mm
-            Arc lengths of the rows.
-        widest_mm : (rows,) array or float, optional
-            Largest diameter of every row, in mm.
+        contour : the active contour with its weights.
+        rows_mm : (rows,), mm; arc lengths of the rows.
+        widest_mm : (rows,) or; largest diameter of every row, in mm.
 
-        Returns
-        -------
-        State
-            The contour before the first iteration.
+        Returns the contour before the first iteration.
 
         Raises
         ------
@@ -213,15 +207,10 @@ def laid_inside(lay: Callable[[Landing], Laid], proposed: Landing) -> Laid:
 
     Parameters
     ----------
-    lay : callable
-        Deploys or previews the device at a landing and raises a LandingError if it does not fit there.
-    proposed : Landing
-        Where the device is tried first.
+    lay : deploys or previews the device at a landing and raises a LandingError if it does not fit there.
+    proposed : where the device is tried first.
 
-    Returns
-    -------
-    object
-        Return value of `lay` for the first landing that fits.
+    Returns return value of `lay` for the first landing that fits.
 
     Raises
     ------

@@ -67,23 +67,12 @@ def slide(
 
     Parameters
     ----------
-    design : Design
-        The device.
-    size : Size
-        Its size.
-    nodes_mm : (rows, columns, 3) array, mm
-        Contour before the crossings move.
-    held : int
-        Row of nodes whose mean position along the device stays the same.
-    laid : callable
-        Puts points between the contour's nodes on the wall. Only laser-cut devices use it.
-    is_opening : (rows, columns) array of bool, optional
-        Nodes over a neck or an ostium, where free crowns of open cells may leave the artery.
+    nodes_mm : (rows, columns, 3), mm; contour before the crossings move.
+    held : row of nodes whose mean position along the device stays the same.
+    laid : puts points between the contour's nodes on the wall. Only laser-cut devices use it.
+    is_opening : (rows, columns); nodes over a neck or an ostium, where free crowns of open cells may leave the artery.
 
-    Returns
-    -------
-    Slid
-        The contour after the crossings have moved.
+    Returns the contour after the crossings have moved.
     """
     shape = grid(design, size)
     continued_mm = _continued(nodes_mm)
@@ -226,17 +215,11 @@ def extrapolated(known: Floats | Ints, values: Floats, wanted: Floats) -> Floats
 
     Parameters
     ----------
-    known : (n,) array
-        Increasing places.
-    values : (n,) array
-        Values at these places.
-    wanted : array of any shape
-        Places to interpolate at.
+    known : (n,); increasing places.
+    values : (n,); values at these places.
+    wanted : array of any shape; places to interpolate at.
 
-    Returns
-    -------
-    array of the shape of `wanted`
-        Interpolated values.
+    Returns array of the shape of `wanted`: interpolated values.
     """
     i = np.clip(np.searchsorted(known, wanted, side="right") - 1, 0, len(known) - 2)
     share = (wanted - known[i]) / (known[i + 1] - known[i])

@@ -61,17 +61,7 @@ def propose_size(design: Design, anatomy: Anatomy) -> Size:
 
     Narrower sizes are proposed where the artery is too short for a wider one.
 
-    Parameters
-    ----------
-    design : Design
-        The device.
-    anatomy : Anatomy
-        The artery.
-
-    Returns
-    -------
-    Size
-        The proposed size.
+    Returns the proposed size.
 
     Raises
     ------
@@ -103,17 +93,9 @@ def propose_landing(design: Design, anatomy: Anatomy, size: Size) -> Landing:
 
     Parameters
     ----------
-    design : Design
-        The device.
-    anatomy : Anatomy
-        The artery.
-    size : Size
-        Size of the device.
+    size : size of the device.
 
-    Returns
-    -------
-    Landing
-        Where the middle row lies.
+    Returns where the middle row lies.
     """
     profile = expected_profile(design, size, anatomy)
     target_mm = float(np.mean(neck_span_mm(anatomy)))
@@ -135,17 +117,9 @@ def reach_mm(design: Design, anatomy: Anatomy, size: Size) -> float:
 
     Parameters
     ----------
-    design : Design
-        The device.
-    anatomy : Anatomy
-        The artery.
-    size : Size
-        Size of the device.
+    size : size of the device.
 
-    Returns
-    -------
-    float
-        Length on the shorter side, in mm; -inf where the size does not fit the artery.
+    Returns length on the shorter side, in mm; -inf where the size does not fit the artery.
     """
     fits = _fits(anatomy, *_span(design, anatomy, size))
     return _margin(design, anatomy, size) if fits else -inf

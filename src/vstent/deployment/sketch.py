@@ -80,19 +80,7 @@ class Sketch:
 def bed(design: Design, size: Size, anatomy: Anatomy) -> Bed:
     """Measure the wall of an artery for a device, independent of where the device is landed.
 
-    Parameters
-    ----------
-    design : Design
-        The device.
-    size : Size
-        Its size.
-    anatomy : Anatomy
-        The artery.
-
-    Returns
-    -------
-    Bed
-        Contour of the device and its gap to the wall along the whole artery.
+    Returns contour of the device and its gap to the wall along the whole artery.
     """
     axis, columns = anatomy.parent.axis, grid(design, size).columns
     across = planes(axis)
@@ -122,15 +110,10 @@ def sketch(wall: Bed, landing: Landing) -> Sketch:
 
     Parameters
     ----------
-    wall : Bed
-        Wall measured for this device and size.
-    landing : Landing
-        Where the device is landed.
+    wall : wall measured for this device and size.
+    landing : where the device is landed.
 
-    Returns
-    -------
-    Sketch
-        The device and the uncertainty of its ends.
+    Returns the device and the uncertainty of its ends.
 
     Raises
     ------

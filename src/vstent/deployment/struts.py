@@ -54,17 +54,7 @@ def over_restored(stent: Stent, anatomy: Anatomy) -> Stent:
     obliquely through pores, so a margin is needed. Compared with the whole device, the neck inflow of the demo with the
     screen of an Enterprise is 11 % higher with a margin of half a spacing and 1 % higher with one spacing.
 
-    Parameters
-    ----------
-    stent : Stent
-        The deployed device.
-    anatomy : Anatomy
-        The artery.
-
-    Returns
-    -------
-    Stent
-        The stent with fewer and shorter wires.
+    Returns the stent with fewer and shorter wires.
     """
     is_over = is_over_restored(stent, anatomy, stent.wire_points_mm)
     wire = stent.point_wires
@@ -83,19 +73,7 @@ def over_restored(stent: Stent, anatomy: Anatomy) -> Stent:
 def is_over_restored(stent: Stent, anatomy: Anatomy, points_mm: Floats) -> Bools:
     """Return whether points on a stent lie over a neck or an ostium, or within one wire spacing of it.
 
-    Parameters
-    ----------
-    stent : Stent
-        The deployed device.
-    anatomy : Anatomy
-        The artery.
-    points_mm : (n, 3) array, mm
-        Points on the stent.
-
-    Returns
-    -------
-    (n,) array of bool
-        Points whose closest point of the landing surface is within one spacing of restored wall.
+    Shapes: `points_mm` (n, 3).
     """
     surface = anatomy.parent.landing_surface
     closing = Surface(surface.vertices_mm, surface.faces[anatomy.parent.is_restored_face])
@@ -109,13 +87,9 @@ def united(solid: Surface) -> Surface:
 
     Parameters
     ----------
-    solid : Surface
-        Solids of all wires, from `struts`.
+    solid : solids of all wires, from `struts`.
 
-    Returns
-    -------
-    Surface
-        The merged solid.
+    Returns the merged solid.
 
     Raises
     ------

@@ -84,20 +84,6 @@ def landing_wall(anatomy: Anatomy, inside: Sequence[Stent] = ()) -> tuple[Abstra
     """Build the wall against which a device opens.
 
     It is the landing surface. Where devices are already deployed, it is the inner face of the last of them instead.
-
-    Parameters
-    ----------
-    anatomy : Anatomy
-        The artery.
-    inside : sequence of Stent, optional
-        Devices that are already in the artery, in the order of their deployment.
-
-    Returns
-    -------
-    wall : AbstractWall
-        The wall.
-    is_patient : (m,) array of bool
-        Faces that are the patient's own wall, neither restored or continued wall nor device.
     """
     surface = anatomy.parent.landing_surface
     is_patient = anatomy.parent.is_patient_face

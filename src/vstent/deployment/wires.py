@@ -47,21 +47,11 @@ def draw(design: Design, size: Size, nodes_mm: Floats, wall: AbstractWall, crown
 
     Parameters
     ----------
-    design : Design
-        The device.
-    size : Size
-        Its size.
-    nodes_mm : (rows, columns, 3) array, mm
-        Nodes of the contour.
-    wall : AbstractWall
-        Wall of the artery.
-    crowns : Crowns, optional
-        Free crowns of an open-cell device; None: they lie where they would be joined.
+    nodes_mm : (rows, columns, 3), mm; nodes of the contour.
+    wall : wall of the artery.
+    crowns : free crowns of an open-cell device; None: they lie where they would be joined.
 
-    Returns
-    -------
-    Wires
-        Axes of all wires or rings of struts.
+    Returns axes of all wires or rings of struts.
     """
     shape = grid(design, size)
     if isinstance(design, Braid):

@@ -57,13 +57,9 @@ def add_devices(path: Path) -> dict[str, Design]:
 
     Parameters
     ----------
-    path : Path
-        TOML file in the form of ``catalogue.toml``.
+    path : TOML file in the form of ``catalogue.toml``.
 
-    Returns
-    -------
-    dict
-        Added designs by their key.
+    Returns added designs by their key.
 
     Raises
     ------
@@ -136,17 +132,10 @@ def find_sizes(design: Design, *, diameter_mm: float | None = None, length_mm: f
 
     Parameters
     ----------
-    design : Design
-        The device.
-    diameter_mm : float, optional
-        Label diameter, in mm; None matches any.
-    length_mm : float, optional
-        Label length, in mm; None matches any.
+    diameter_mm : label diameter, in mm; None matches any.
+    length_mm : label length, in mm; None matches any.
 
-    Returns
-    -------
-    tuple of Size
-        Sizes by increasing diameter, then length.
+    Returns sizes by increasing diameter, then length.
 
     Raises
     ------

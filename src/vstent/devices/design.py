@@ -353,38 +353,15 @@ def angle_rad(design: Design, size: Size, diameter_mm: float | np.ndarray) -> np
 
     Parameters
     ----------
-    design : Design
-        The device.
-    size : Size
-        Its size.
-    diameter_mm : float or array, mm
-        Local diameter; values above the largest free diameter count as that.
+    diameter_mm : float or, mm; local diameter; values above the largest free diameter count as that.
 
-    Returns
-    -------
-    array of the shape of `diameter_mm`, rad
-        Angle between wire and axis.
+    Returns array of the shape of `diameter_mm`, rad: angle between wire and axis.
     """
     return np.arcsin(free_sine(design, size) * np.minimum(diameter_mm, widest_mm(design, size)) / size.free_diameter_mm)
 
 
 def strips_fraction(design: Design, size: Size, diameter_mm: float) -> float:
-    """Compute the fraction of the circumference that wires of one hand of the mesh, or all struts, occupy side by side.
-
-    Parameters
-    ----------
-    design : Design
-        The device.
-    size : Size
-        Its size.
-    diameter_mm : float
-        Local diameter, in mm.
-
-    Returns
-    -------
-    float
-        Fraction; from 1 on there is no room for them.
-    """
+    """Compute the fraction of the circumference that wires of one hand, or all struts, occupy side by side."""
     per_axis_mm = np.pi * diameter_mm * float(np.cos(angle_rad(design, size, diameter_mm)))
     if isinstance(design, LaserCut):
         return float(design.n_columns * design.strut_width_um * MM_PER_UM / per_axis_mm)

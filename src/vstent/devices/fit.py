@@ -93,16 +93,11 @@ def fit(measurements: tuple[Measurement, ...], like: Design) -> Fitted:
 
     Parameters
     ----------
-    measurements : tuple of Measurement
-        Measured values of specimens of one device.
-    like : Design
-        A device of the same family whose numbers are the priors. Their standard errors are those of numbers that lie
-        anywhere in its ranges, or `USUAL` if that is more.
+    measurements : measured values of specimens of one device.
+    like : a device of the same family whose numbers are the priors. Their standard errors are those of numbers that
+        lie anywhere in its ranges, or `USUAL` if that is more.
 
-    Returns
-    -------
-    Fitted
-        Values, standard errors, correlations and fitted measurements.
+    Returns values, standard errors, correlations and fitted measurements.
 
     Raises
     ------
@@ -200,19 +195,10 @@ def predict(design: Design, size: Size, name: str, tube_mm: float | None) -> flo
 
     Parameters
     ----------
-    design : Design
-        The device.
-    size : Size
-        Its size.
-    name : str
-        Column of the measurement.
-    tube_mm : float or None
-        Inner diameter of the tube, in mm; None: free.
+    name : column of the measurement.
+    tube_mm : inner diameter of the tube, in mm; None: free.
 
-    Returns
-    -------
-    float
-        Value, in the unit of the column.
+    Returns value, in the unit of the column.
     """
     offset_mm = 2 * design.wall_offset_um * MM_PER_UM
     free_mm = size.free_diameter_mm

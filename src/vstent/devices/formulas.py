@@ -99,17 +99,9 @@ def compacted(design: Design, size: Size, fraction: float) -> Size:
 
     Parameters
     ----------
-    design : Design
-        The device.
-    size : Size
-        Its size.
-    fraction : float
-        Fraction q of the length.
+    fraction : fraction q of the length.
 
-    Returns
-    -------
-    Size
-        The compacted size.
+    Returns the compacted size.
 
     Raises
     ------
@@ -139,19 +131,10 @@ def row_spacing_mm(
 
     Parameters
     ----------
-    design : Design
-        The device.
-    size : Size
-        Its size.
-    diameter_mm : float or array, mm
-        Local diameter D; values above the largest free diameter count as that.
-    curvature_per_mm : float or array, per mm, optional
-        Curvature of the axis.
+    diameter_mm : float or, mm; local diameter D; values above the largest free diameter count as that.
+    curvature_per_mm : float or, per mm; curvature of the axis.
 
-    Returns
-    -------
-    array, mm
-        Row spacing h.
+    Returns row spacing h.
 
     Notes
     -----
@@ -200,20 +183,6 @@ def foreshortening_fraction(design: Design, size: Size, diameter_mm: float) -> f
     """Compute the shortening at a local diameter relative to the label.
 
     It is 1 - L(D)/L_label = 1 - (1 - q) cos(alpha)/cos(alpha_label), with q the compaction.
-
-    Parameters
-    ----------
-    design : Design
-        The device.
-    size : Size
-        Its size.
-    diameter_mm : float
-        Local diameter D, in mm.
-
-    Returns
-    -------
-    float
-        Shortening as a fraction of the label length.
     """
     here, label = angle_rad(design, size, np.array([diameter_mm, size.diameter_mm]))
     return float(1 - (1 - size.compaction_fraction) * np.cos(here) / np.cos(label))
@@ -229,17 +198,9 @@ def coverage_fraction(design: Design, size: Size, diameter_mm: float) -> float:
 
     Parameters
     ----------
-    design : Design
-        The device.
-    size : Size
-        Its size.
-    diameter_mm : float
-        Local diameter D, in mm.
+    diameter_mm : local diameter D, in mm.
 
-    Returns
-    -------
-    float
-        Metal coverage.
+    Returns metal coverage.
     """
     strips = min(1.0, strips_fraction(design, size, diameter_mm))
     if isinstance(design, LaserCut):
@@ -258,17 +219,9 @@ def pore_density_per_mm2(design: Design, size: Size, diameter_mm: float) -> floa
 
     Parameters
     ----------
-    design : Design
-        The device.
-    size : Size
-        Its size.
-    diameter_mm : float
-        Local diameter D, in mm.
+    diameter_mm : local diameter D, in mm.
 
-    Returns
-    -------
-    float
-        Pore density, per mm2.
+    Returns pore density, per mm2.
     """
     tangent = float(np.tan(angle_rad(design, size, diameter_mm)))
     joined = design.joined_fraction if isinstance(design, LaserCut) else 1.0

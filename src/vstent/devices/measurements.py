@@ -87,16 +87,11 @@ def read_measurements(path: Path, design: Design) -> tuple[Measurement, ...]:
 
     Parameters
     ----------
-    path : Path
-        CSV file with a header. Every row has the columns `LABEL`, and any of the others; empty cells are left out. A
-        column ``length_error_mm`` holds the standard error of ``length_mm``, and likewise for the other quantities.
-    design : Design
-        A device of the same family, with the same counts and widths.
+    path : CSV file with a header. Every row has the columns `LABEL`, and any of the others; empty cells are left out.
+        A column ``length_error_mm`` holds the standard error of ``length_mm``, and likewise for the other quantities.
+    design : a device of the same family, with the same counts and widths.
 
-    Returns
-    -------
-    tuple of Measurement
-        All values, row after row.
+    Returns all values, row after row.
 
     Raises
     ------

@@ -66,20 +66,13 @@ def altered(design: Design, size: Size, values: Mapping[str, float]) -> tuple[De
 
     Parameters
     ----------
-    design : Design
-        The device.
-    size : Size
-        Its size.
-    values : dict
-        New values by the name of the number (`Range.name`). Counts are rounded to the nearest even number. The value of
-        ``label_length_mm`` is added to the length.
+    values : new values by the name of the number (`Range.name`). Counts are rounded to the nearest even number. The
+        value of ``label_length_mm`` is added to the length.
 
     Returns
     -------
-    design : Design
-        The device; it offers only the altered size.
-    size : Size
-        The altered size. Its label diameter stays, and its free diameter follows the margin.
+    design : the device; it offers only the altered size.
+    size : the altered size. Its label diameter stays, and its free diameter follows the margin.
     """
     size = _size(size, values)
     return _design(design, (size,), values), size
@@ -90,17 +83,12 @@ def altered_sizes(design: Design, values: Mapping[str, float]) -> tuple[Design, 
 
     Parameters
     ----------
-    design : Design
-        The device.
-    values : dict
-        New values by the name of the number, as in `altered`.
+    values : new values by the name of the number, as in `altered`.
 
     Returns
     -------
-    design : Design
-        The device with all its sizes altered.
-    originals : dict
-        Size of the catalogue by altered size.
+    design : the device with all its sizes altered.
+    originals : size of the catalogue by altered size.
     """
     originals = {_size(size, values): size for size in design.sizes}
     return _design(design, tuple(originals), values), originals

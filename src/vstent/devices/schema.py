@@ -361,15 +361,10 @@ def parse(text: str, name: str = "The device catalogue") -> dict[str, Design]:
 
     Parameters
     ----------
-    text : str
-        Content of the file.
-    name : str, optional
-        Name of the catalogue in messages.
+    text : content of the file.
+    name : name of the catalogue in messages.
 
-    Returns
-    -------
-    dict
-        Designs by their key.
+    Returns designs by their key.
 
     Raises
     ------

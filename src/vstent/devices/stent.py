@@ -156,13 +156,9 @@ def row_diameters_mm(nodes_mm: Floats) -> Floats:
 
     Parameters
     ----------
-    nodes_mm : (rows, columns, 3) array, mm
-        Nodes of the contour.
+    nodes_mm : (rows, columns, 3), mm; nodes of the contour.
 
-    Returns
-    -------
-    (rows,) array, mm
-        Diameters.
+    Returns (rows,), mm: diameters.
     """
     around_mm = np.roll(nodes_mm, -1, axis=1) - nodes_mm
     columns = nodes_mm.shape[1]
@@ -183,15 +179,11 @@ def tube_faces(rows: int, columns: int) -> Ints:
 
     Parameters
     ----------
-    rows : int
-        Number of rings.
-    columns : int
-        Number of vertices in a ring.
+    rows : number of rings.
+    columns : number of vertices in a ring.
 
-    Returns
-    -------
-    (2 (rows - 1) columns, 3) array of int
-        Triangles. They face outward if each ring runs counter-clockwise about the direction of increasing rows.
+    Returns (2 (rows - 1) columns, 3): triangles. They face outward if each ring runs counter-clockwise about the
+    direction of increasing rows.
     """
     row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns), indexing="ij")
     a = row * columns + column

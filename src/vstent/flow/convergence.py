@@ -66,10 +66,8 @@ def observed(values: tuple[float, float, float], ratio: float = RATIO) -> Conver
 
     Parameters
     ----------
-    values : tuple of 3 float
-        Values from the coarsest to the finest grid.
-    ratio : float
-        Refinement ratio between consecutive grids.
+    values : values from the coarsest to the finest grid.
+    ratio : refinement ratio between consecutive grids.
     """
     coarse, middle, fine = values
     before, last = middle - coarse, fine - middle
@@ -94,12 +92,9 @@ def convergence(
 
     Parameters
     ----------
-    case : FlowCase
-        The flow; its grid spacing is the finest.
-    folder : Path, optional
-        Folder for files of the engine, with a subfolder for every run.
-    told : callable
-        Called after every run with the completed fraction of the study and a sentence on the run.
+    case : the flow; its grid spacing is the finest.
+    folder : folder for files of the engine, with a subfolder for every run.
+    told : called after every run with the completed fraction of the study and a sentence on the run.
 
     Raises
     ------

@@ -16,16 +16,7 @@ STALLED: Final = 0.8
 def cycle_change(history: Floats) -> float:
     """Return the largest relative change of any monitored quantity between the last two cycles.
 
-    Parameters
-    ----------
-    history : (phases, quantities) float
-        Monitored quantities at every stored phase.
-
-    Returns
-    -------
-    float
-        Root-mean-square change over the quantity's root mean square. inf between the ends of cycles or before two
-        cycles are complete; nan when the history is not finite.
+    Shapes: `history` (phases, quantities).
     """
     if not np.isfinite(history[-1]).all():
         return float("nan")
@@ -40,14 +31,7 @@ def cycle_change(history: Floats) -> float:
 def cycles_advice(changes: Floats, cycles: int, *, is_converged: bool) -> str:
     """Describe the convergence of the cycles and what to do about it.
 
-    Parameters
-    ----------
-    changes : (c,) float
-        Changes between consecutive cycles, as fractions.
-    cycles : int
-        Number of the last cycle.
-    is_converged : bool
-        Whether the last change is below the tolerance.
+    Shapes: `changes` (c,).
     """
     if len(changes) == 0:
         return "Only a single cycle was computed: allow at least two to check that the flow is periodic."

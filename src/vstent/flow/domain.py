@@ -165,16 +165,7 @@ def section_pressure_Pa(vessel: Vessel, grid: Domain, pressure_Pa: Floats) -> Fl
 def too_fast(grid: Domain, speed_m_s: Floats, blood: Blood, most: float) -> str:
     """Return a warning about cells in which the viscosity is raised for stability, or an empty string.
 
-    Parameters
-    ----------
-    grid : Domain
-        The cells.
-    speed_m_s : (n,) float
-        Speed in every cell.
-    blood : Blood
-        The fluid.
-    most : float
-        Grid Reynolds number (speed x grid spacing / viscosity) above which the viscosity is raised.
+    Shapes: `speed_m_s` (n,).
     """
     cell_reynolds = speed_m_s * grid.cell_size_mm * M_PER_MM / blood.kinematic_viscosity_m2_s
     fastest = int(cell_reynolds.argmax())
@@ -292,12 +283,9 @@ def extend(vessel: Vessel) -> tuple[Surface, Ints, tuple[Floats, ...]]:
 
     Returns
     -------
-    surface : Surface
-        Closed surface.
-    face_patch : (m,) int
-        Patch of every face: 0 wall, k + 1 the end of opening k.
-    sections : tuple of (j, 3) float
-        For every opening the polygon of its end, in mm.
+    surface : closed surface.
+    face_patch : (m,); patch of every face: 0 wall, k + 1 the end of opening k.
+    sections : tuple of (j, 3); for every opening the polygon of its end, in mm.
 
     Raises
     ------
@@ -401,17 +389,10 @@ def septa(surface: Surface, neighbour: Ints, grid: Cells) -> tuple[Ints, Ints]:
 
     Parameters
     ----------
-    surface : Surface
-        Closed boundary of the blood.
-    neighbour : (n, 19) int
-        Neighbours of the cells.
-    grid : Cells
-        The cells.
+    surface : closed boundary of the blood.
+    neighbour : (n, 19); neighbours of the cells.
 
-    Returns
-    -------
-    cell, direction : (s,) int
-        Cell and lattice direction of each link; every pair is listed once.
+    Returns (s,): cell and lattice direction of each link; every pair is listed once.
     """
     is_edge = np.asarray((neighbour < 0).any(axis=1))
     candidate = is_edge[:, None] & (neighbour >= 0) & is_edge[neighbour]

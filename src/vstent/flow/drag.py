@@ -37,10 +37,7 @@ def drag_per_length(diameter: Floats, spacing: Floats) -> Floats:
 
     F' = 8 pi mu U / (1 - 2 ln(2 t) + 2 t^2 / 3 - t^4 / 9), t = pi d / (2 s). It is 10.70 at d / s = 1 / 6.
 
-    Parameters
-    ----------
-    diameter, spacing : (n,) float
-        Wire diameter and distance between wires, in the same unit.
+    Shapes: `diameter, spacing` (n,).
 
     References
     ----------
@@ -57,11 +54,6 @@ def round_diameter(width: float, thickness: float) -> float:
     from the strut depends only on r. With the complete elliptic integrals K and E, width = 4 r (E(m) - (1 - m) K(m)),
     and thickness is the same expression with 1 - m. A square strut has the drag of a round wire 1.18 times as wide;
     resolved rows of the two agree within 1 % (`tests/flow/lattice/test_crossing_cell.py`).
-
-    Parameters
-    ----------
-    width, thickness : float
-        Sides of the section, in the same unit as the result.
     """
 
     def side(m: float) -> float:
@@ -77,12 +69,7 @@ def band_radius_mm(spacing_mm: Floats, cell_size_mm: float) -> Floats:
     It is the geometric mean of the distance between two points of the band: e^(-gamma / 2) (a + b) for points
     distributed about the axis with standard deviations a and b, where gamma is Euler's constant.
 
-    Parameters
-    ----------
-    spacing_mm : (n,) float
-        Distance between wires.
-    cell_size_mm : float
-        Grid spacing.
+    Shapes: `spacing_mm` (n,).
     """
     of_cell_mm = cell_size_mm / np.sqrt(6)
     return np.exp(-np.euler_gamma / 2) * (np.hypot(BREADTH * spacing_mm / np.sqrt(12), of_cell_mm) + of_cell_mm)
@@ -98,10 +85,8 @@ def concentration(diameter_mm: Floats, spacing_mm: Floats, cell_size_mm: float) 
 
     Parameters
     ----------
-    diameter_mm, spacing_mm : (n,) float
-        Wire diameter and distance between wires.
-    cell_size_mm : float
-        Grid spacing.
+    diameter_mm, spacing_mm : (n,); wire diameter and distance between wires.
+    cell_size_mm : grid spacing.
     """
     drag, densest = drag_per_length(diameter_mm, spacing_mm), drag_per_length(spacing_mm, spacing_mm)
     band_mm = np.maximum(2 * band_radius_mm(spacing_mm, cell_size_mm), diameter_mm)
@@ -124,14 +109,7 @@ def tangential_share(solidity: Floats, lengthwise: Floats, apart: Floats | float
     A slender rod has half the drag along its axis as across it. Wires in the lee of others, and the height of the two
     layers, raise the ratio: the denser the wires, the less tangential velocity remains.
 
-    Parameters
-    ----------
-    solidity : (n,) float
-        Wire diameter over spacing.
-    lengthwise : (n,) float
-        Mean squared cosine of the angle between wires and artery.
-    apart : (n,) float
-        How far the grid separates the wires and so reproduces the lee itself (see `parted`).
+    Shapes: `solidity` (n,), `lengthwise` (n,), `apart` (n,).
     """
     in_lee = (1 - apart) * (SHARE_FALL + SHARE_PER_SOLIDITY * solidity)
     return 1 / np.maximum(1 / (1 - 0.5 * lengthwise) - in_lee, LEAST_SHARE)

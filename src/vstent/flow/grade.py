@@ -93,12 +93,7 @@ def grade(case: FlowCase, field: FlowField, found: Mapping[str, float]) -> Grade
 
     Parameters
     ----------
-    case : FlowCase
-        What was computed.
-    field : FlowField
-        The flow.
-    found : mapping
-        Its indices (`vstent.flow.indices.indices`).
+    found : mapping; its indices (`vstent.flow.indices.indices`).
     """
     return grade_of(measures_of(case, field, found))
 

@@ -66,19 +66,14 @@ def bands(points_mm: Floats, along_mm: Floats, normals: Floats, spacing_mm: Floa
 
     Parameters
     ----------
-    points_mm, along_mm : (p, 3) float
-        Midpoints of the pieces, and the vectors from end to end.
-    normals : (p, 3) float
-        Unit normals of the surface that the wires span.
-    spacing_mm : (p,) float
-        Local distance between wires.
+    points_mm, along_mm : (p, 3); midpoints of the pieces, and the vectors from end to end.
+    normals : (p, 3); unit normals of the surface that the wires span.
+    spacing_mm : (p,); local distance between wires.
 
     Returns
     -------
-    samples_mm : (p, `ACROSS`, 3) float
-        Sample points across every band.
-    area_mm2 : (p,) float
-        Area that each sample of a piece represents.
+    samples_mm : (p, `ACROSS`, 3); sample points across every band.
+    area_mm2 : (p,); area that each sample of a piece represents.
     """
     length_mm = curves.lengths(along_mm)
     sideways = np.cross(normals, along_mm) / length_mm[:, None]

@@ -17,12 +17,9 @@ def flow_case(anatomy: Anatomy, implants: Sequence[Stent] = (), settings: FlowSe
 
     Parameters
     ----------
-    anatomy : Anatomy
-        The patient's vessel and aneurysms.
-    implants : sequence of Stent, optional
-        Deployed implants, each included both as media and as wires over necks and ostia; none by default.
-    settings : FlowSettings, optional
-        Settings of the flow.
+    anatomy : the patient's vessel and aneurysms.
+    implants : deployed implants, each included both as media and as wires over necks and ostia; none by default.
+    settings : settings of the flow.
     """
     settings = settings or FlowSettings()
     largest = anatomy.aneurysms[0] if anatomy.aneurysms else None
@@ -47,12 +44,8 @@ def vessel_case(
 
     Parameters
     ----------
-    vessel : Vessel
-        The vessel.
-    settings : FlowSettings, optional
-        Settings of the flow.
-    target, media, solids
-        As in `FlowCase`.
+    settings : settings of the flow.
+    target, media, solids : as in `FlowCase`.
     """
     settings = settings or FlowSettings()
     return FlowCase(

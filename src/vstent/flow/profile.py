@@ -19,14 +19,7 @@ def developed_profile(section_mm: Floats, normal: Floats, points_mm: Floats) -> 
     Laminar flow along a straight tube with this section: lap u = -1 with u = 0 on the polygon, solved with five-point
     differences. The result is interpolated linearly between grid points and zero outside.
 
-    Parameters
-    ----------
-    section_mm : (k, 3) float
-        Polygon of the section.
-    normal : (3,) float
-        Unit normal of the section.
-    points_mm : (n, 3) float
-        Points at which the profile is evaluated.
+    Shapes: `section_mm` (k, 3), `normal` (3,), `points_mm` (n, 3).
 
     References
     ----------

@@ -131,16 +131,7 @@ def read_through_mL_s(grid: Cells, velocity_m_s: Floats, places: Floats, area_mm
     Cubic Lagrange interpolation from the surrounding 64 cells is used, because linear interpolation underestimates the
     peak of a jet (by 1 to 2 % of the neck inflow without a device).
 
-    Parameters
-    ----------
-    grid : Cells
-        The cells.
-    velocity_m_s : (n, 3) float
-        Their velocity.
-    places : (p, 3) float
-        Grid coordinates of the sample points.
-    area_mm2 : (p, 3) float
-        Area vectors of the sample points.
+    Shapes: `velocity_m_s` (n, 3), `places` (p, 3), `area_mm2` (p, 3).
     """
     return through_mL_s(lattice_sampling.interpolate_cubic(grid.index, velocity_m_s, places), area_mm2)
 

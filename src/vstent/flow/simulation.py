@@ -109,19 +109,14 @@ def simulate_case(
 
     Parameters
     ----------
-    case : FlowCase
-        The flow to compute.
-    start : FlowField, optional
-        Flow in the same vessel without a stent, to start from.
-    similar : FlowField, optional
-        Flow in the same vessel with a similar stent, to start from instead, if it is steady in a refined sac too; no
-        first guess is then computed.
-    folder : Path, optional
-        Folder for the files of an engine that works with files, also used to resume; None: they are deleted.
-    progress : callable, optional
-        Called at every check; an exception that it raises ends the run.
-    checkpoint : Checkpoint, optional
-        Storage for unfinished runs. The same flow resumes from there, with an identical result to the last bit.
+    case : the flow to compute.
+    start : flow in the same vessel without a stent, to start from.
+    similar : flow in the same vessel with a similar stent, to start from instead, if it is steady in a refined sac
+        too; no first guess is then computed.
+    folder : folder for the files of an engine that works with files, also used to resume; None: they are deleted.
+    progress : called at every check; an exception that it raises ends the run.
+    checkpoint : storage for unfinished runs. The same flow resumes from there, with an identical result to the last
+        bit.
 
     Raises
     ------
@@ -151,13 +146,6 @@ def memory_bytes(case: FlowCase) -> float | None:
 def engine_class(numerics: Numerics, *, is_pulsatile: bool) -> type[AbstractEngine[Any]]:
     """Return the engine that the settings name: one of vstent's own or a plug-in.
 
-    Parameters
-    ----------
-    numerics : Numerics
-        Numerical settings.
-    is_pulsatile : bool
-        Whether the inflow follows a waveform.
-
     Raises
     ------
     PluginError
@@ -184,8 +172,7 @@ def check_engine(flow: FlowSettings | None) -> None:
 
     Parameters
     ----------
-    flow : FlowSettings or None
-        Settings of the flow; None: no flow is computed.
+    flow : settings of the flow; None: no flow is computed.
 
     Raises
     ------

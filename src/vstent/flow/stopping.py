@@ -23,15 +23,7 @@ LEAST_CROSSINGS: Final = 5
 def quantities_left(history: Floats) -> float:
     """Return the largest remaining change of any monitored quantity, the worst of the last `CHECKS_AGREEING` checks.
 
-    Parameters
-    ----------
-    history : (checks, quantities) float
-        Monitored quantities at every check.
-
-    Returns
-    -------
-    float
-        Fraction of the quantity; nan when the history is not finite, inf with too few checks.
+    Shapes: `history` (checks, quantities).
     """
     return max(fraction_left(history[: len(history) - k]) for k in range(min(CHECKS_AGREEING, len(history))))
 
@@ -69,10 +61,7 @@ def standard_error(history: Floats) -> float:
     larger, as for a drifting quantity. For a quantity that has crossed its mean fewer than `LEAST_CROSSINGS` times the
     whole range is used. inf with too few checks.
 
-    Parameters
-    ----------
-    history : (checks, quantities) float
-        Monitored quantities at every check.
+    Shapes: `history` (checks, quantities).
     """
     if len(history) < BATCHES * LEAST_IN_BATCH:
         return float("inf")

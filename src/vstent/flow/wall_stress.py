@@ -21,16 +21,7 @@ def wall_stress(
     The stress is the tangential traction mu du/dn of the blood on the wall. It comes from a least-squares fit that is
     exact for Poiseuille flow (see `sampling.fit_wall`).
 
-    Parameters
-    ----------
-    domain : Domain
-        The cells and their distance from the wall.
-    velocity_m_s, pressure_Pa : (n, 3) float, (n,) float
-        Velocity and pressure of the cells.
-    lumen : Surface
-        The wall, open at its ends, with outward normals.
-    blood : Blood
-        The fluid.
+    Shapes: `velocity_m_s, pressure_Pa` (n, 3).
     """
     shear_per_s, wall_pressure_Pa = _shear(domain, velocity_m_s, pressure_Pa, lumen)
     viscosity_Pa_s = blood.viscosity_at_Pa_s(np.linalg.norm(shear_per_s, axis=1))
@@ -47,14 +38,9 @@ def mean_shear_Pa(domain: Domain, velocity_m_s: Floats, speed_m_s: Floats, *, lu
 
     Parameters
     ----------
-    domain : Domain
-        The cells and their distance from the wall.
-    velocity_m_s, speed_m_s : (n, 3) float, (n,) float
-        Time-averaged velocity and time-averaged speed of the cells.
-    lumen : Surface
-        The wall, open at its ends, with outward normals.
-    blood : Blood
-        The fluid.
+    domain : the cells and their distance from the wall.
+    velocity_m_s, speed_m_s : (n, 3) float, (n,); Time-averaged velocity and time-averaged speed of the cells.
+    lumen : the wall, open at its ends, with outward normals.
     """
     shear_per_s, _ = _shear(domain, velocity_m_s, np.zeros(len(speed_m_s)), lumen)
     beyond_m_s = speed_m_s - np.linalg.norm(velocity_m_s, axis=1)

@@ -107,10 +107,6 @@ RESAMPLED = 512
 def read_waveform(source: str) -> Waveform:
     """Return the published waveform, or the one in a CSV file.
 
-    Parameters
-    ----------
-    source : ``published``, or the path of a file with the times (s) and flow rates of one cycle in two columns.
-
     Raises
     ------
     InputError
@@ -133,12 +129,7 @@ def read_waveform(source: str) -> Waveform:
 def waveform_of(time_s: "Floats", flow: "Floats") -> Waveform:
     """Fit a waveform to a measured cycle.
 
-    Parameters
-    ----------
-    time_s : (n,) float
-        Increasing times; the last is the start of the next cycle.
-    flow : (n,) float
-        Flow rate in any unit. The last sample is replaced by the first.
+    Shapes: `time_s` (n,), `flow` (n,).
 
     Raises
     ------

@@ -43,18 +43,6 @@ def read_apart(
 ) -> Iterator[Found]:
     """Read a file in a child process; the arrays are mapped from files that are removed at the end of the block.
 
-    Parameters
-    ----------
-    what : reader; a key of `vstent.io.child.READERS`.
-    path : the file or folder.
-    options : arguments of the reader that JSON can hold.
-    files : all files that are read; their size limits memory and time.
-
-    Yields
-    ------
-    tuple
-        Arrays by name, and a dictionary with everything else.
-
     Raises
     ------
     ReadError

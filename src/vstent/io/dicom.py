@@ -138,17 +138,6 @@ def read_dicom(path: Path, *, has_spacing: bool = False, acquisition: int | None
     copies of a slice are dropped. Where a series holds several acquisitions of the same slices, such as mask and fill
     runs, one is read: the requested one, else the one with the brightest vessels. MONOCHROME1 images are inverted.
 
-    Parameters
-    ----------
-    path : a folder, its DICOMDIR, or one file of a series; a multi-frame file is read alone.
-    has_spacing : whether the caller replaces the spacing, so that the slices need not state it.
-    acquisition : number of the acquisition in a series that holds several, counted from 1.
-
-    Returns
-    -------
-    Image
-        Voxels (i, j, k) and the affine from voxel to LPS mm.
-
     Raises
     ------
     ReadError

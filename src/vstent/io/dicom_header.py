@@ -7,13 +7,7 @@ MOMENT: Final = ("20000101", "120000")
 
 
 def research_header(sop_class: str, digest: str) -> Any:
-    """Return a dataset with identifiers, empty patient fields and one moment, for files of one series.
-
-    Parameters
-    ----------
-    sop_class : identifier of the storage class.
-    digest : digest of the content, from which the identifiers follow.
-    """
+    """Return a dataset with identifiers, empty patient fields and one moment, for files of one series."""
     from pydicom.dataset import Dataset, FileMetaDataset
     from pydicom.uid import ExplicitVRLittleEndian, generate_uid
 

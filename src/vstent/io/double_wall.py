@@ -30,10 +30,6 @@ def inner_wall(surface: Surface) -> Surface | None:
 
     The faces are divided at sharp edges. A hollow model has two large parts, one inside the other at a nearly constant
     distance; the inner one has the smaller area.
-
-    Parameters
-    ----------
-    surface : the surface, in any unit.
     """
     kept, same = topology.first_equals(surface.vertices_mm)
     welded = same[surface.faces].astype(np.int32)

@@ -17,16 +17,6 @@ from vstent.io.text_headers import fields_of, holds_segments, mm_per_unit, state
 def read_itk(path: Path, *, has_spacing: bool) -> Image:
     """Read one volume from a NRRD or MetaImage file.
 
-    Parameters
-    ----------
-    path : the file, or the header of a file of voxels.
-    has_spacing : whether the caller replaces the spacing, so that the header need not state it.
-
-    Returns
-    -------
-    Image
-        Voxels (i, j, k) and the affine from voxel to LPS mm.
-
     Raises
     ------
     ReadError

@@ -15,14 +15,7 @@ MOST_FOLDS: Final = 200
 
 
 def refuse_bomb(name: str, n_bytes: int, n_held: int) -> None:
-    """Raise ReadError for voxels of too many bytes, or of too many for the size of the file.
-
-    Parameters
-    ----------
-    name : the file, and what it holds.
-    n_bytes : size of the voxels.
-    n_held : size of the file.
-    """
+    """Raise ReadError for voxels of too many bytes, or of too many for the size of the file."""
     if n_bytes > MOST_BYTES:
         raise ReadError(
             f"{name}, {n_bytes / 1e9:.3g} GB, which is more than a scan of the head. Export the part around the "

@@ -31,16 +31,6 @@ def read_nifti(path: Path, *, has_spacing: bool) -> Image:
     Scaled integers (``scl_slope``, ``scl_inter``) are returned as scaled values. The frame is the sform where its code
     is set, else the qform. Where neither is set, the voxel axes are taken as LPS axes.
 
-    Parameters
-    ----------
-    path : the file; its first bytes say whether it is compressed.
-    has_spacing : whether the caller replaces the spacing, so that the header need not state it.
-
-    Returns
-    -------
-    image : Image
-        Voxels (i, j, k) and the affine from voxel to LPS mm.
-
     Raises
     ------
     ReadError

@@ -23,12 +23,7 @@ _STRIPS: Final = re.compile(r"element\s+tristrips\s+(\d+)\s+property\s+list\s+(\
 
 
 def ply_strips(path: Path) -> NDArray[np.int64]:
-    """Return the triangles (m, 3) of the strips in a PLY file, which follow its vertices; none where it has none.
-
-    Parameters
-    ----------
-    path : the file, text or binary; a strip ends with -1 or with its list.
-    """
+    """Return the triangles (m, 3) of the strips in a PLY file, which follow its vertices; none where it has none."""
     data = path.read_bytes()
     end = re.search(rb"end_header\r?\n", data)
     head = data[: end.start()].decode("ascii", "replace") if end else ""

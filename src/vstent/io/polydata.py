@@ -36,10 +36,7 @@ def cells_of(cells: Ints) -> Any:
 def ragged_cells(connectivity: Ints, starts: Ints) -> Any:
     """Return cells with different numbers of points as vtkCellArray.
 
-    Parameters
-    ----------
-    connectivity : point numbers of all cells, one cell after another.
-    starts : (m + 1,) index of the first point number of every cell, and the length of `connectivity`.
+    Shapes: `starts` (m + 1,).
     """
     from vtkmodules.util.numpy_support import numpy_to_vtkIdTypeArray
     from vtkmodules.vtkCommonDataModel import vtkCellArray

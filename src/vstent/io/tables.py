@@ -23,10 +23,7 @@ def read_columns(path: Path, count: int) -> Floats:
     path : the file; columns are separated by commas, semicolons or tabs.
     count : number of columns.
 
-    Returns
-    -------
-    Floats
-        (n, count) numbers.
+    Returns (n, count) numbers.
 
     Raises
     ------
@@ -84,10 +81,7 @@ def write_parquet(path: Path, rows: Sequence[Mapping[str, Any]]) -> bool:
     path : the file.
     rows : values by column name.
 
-    Returns
-    -------
-    bool
-        False where pyarrow is not installed; nothing is written then.
+    Returns False where pyarrow is not installed; nothing is written then.
     """
     try:
         from pyarrow import parquet, table

@@ -63,11 +63,6 @@ def read_mesh(path: Path) -> Mesh:
 def read_vtk_image(path: Path, *, has_spacing: bool) -> Image:
     """Read a VTK image (``.vti``, or ``.vtk`` of structured points); its axes are taken as LPS.
 
-    Parameters
-    ----------
-    path : the file.
-    has_spacing : whether the caller replaces the spacing, so that the file need not state it.
-
     Raises
     ------
     ReadError

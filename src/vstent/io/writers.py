@@ -121,17 +121,7 @@ _CORNERS: Final = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1
 def grid_corners(centers_mm: Floats, sizes_mm: Floats) -> tuple[Floats, Ints]:
     """Return the corners of grid cells, each once, and the corners of every cell.
 
-    Parameters
-    ----------
-    centers_mm : (c, 3) centers of the cells.
-    sizes_mm : (c,) edges of the cells, multiples of the smallest.
-
-    Returns
-    -------
-    corners_mm : Floats
-        (p, 3) corners.
-    cells : Ints
-        (c, 8) numbers of the corners of every cell, in VTK's order of a hexahedron.
+    Shapes: `centers_mm` (c, 3), `sizes_mm` (c,).
     """
     if not len(centers_mm):
         return np.zeros((0, 3)), np.zeros((0, 8), dtype=np.int32)

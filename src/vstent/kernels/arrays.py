@@ -15,14 +15,10 @@ def read_only(values: Any, dtype: DTypeLike, shape: tuple[int, ...], name: str) 
 
     Parameters
     ----------
-    values : array_like
-        Values.
-    dtype : dtype
-        Type of the array.
-    shape : tuple of int
-        Expected shape; -1 stands for any length.
-    name : str
-        Field name for the error message.
+    values : array_like; values.
+    dtype : dtype; type of the array.
+    shape : tuple of; expected shape; -1 stands for any length.
+    name : field name for the error message.
 
     Raises
     ------

@@ -70,10 +70,8 @@ def forget_outdated(sources: Path, *also: Path) -> None:
 
     Parameters
     ----------
-    sources : Path
-        Folder of the kernels.
-    also : Path
-        Further folders with functions that they call.
+    sources : folder of the kernels.
+    also : further folders with functions that they call.
     """
     place = kept_in(sources)
     files = [file for folder in (sources, *also) for file in sorted(folder.glob("*.py"))]

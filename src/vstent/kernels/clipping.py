@@ -12,10 +12,8 @@ def clip(vertices: Floats, faces: Ints, value: Floats) -> tuple[Floats, Ints]:
 
     Parameters
     ----------
-    vertices, faces : (n, 3), (m, 3)
-        The mesh.
-    value : (n,)
-        Value at every vertex, linear on every face.
+    vertices, faces : (n, 3), (m, 3); the mesh.
+    value : (n,); value at every vertex, linear on every face.
     """
     positive = value[faces] > 0
     count = positive.sum(axis=1)

@@ -17,14 +17,10 @@ def covered_fractions(nodes: Floats, starts: Floats, ends: Floats, radius: Float
 
     Parameters
     ----------
-    nodes : (rows, columns, 3)
-        Grid; columns are periodic.
-    starts, ends : (m, 3)
-        Ends of the wire segments, which must be shorter than the grid spacing.
-    radius : (m,)
-        Half-widths of the wires.
-    samples : int
-        Number of sample points per cell and direction.
+    nodes : (rows, columns, 3); Grid; columns are periodic.
+    starts, ends : (m, 3); ends of the wire segments, which must be shorter than the grid spacing.
+    radius : (m,); Half-widths of the wires.
+    samples : number of sample points per cell and direction.
     """
     rows, columns = nodes.shape[:2]
     nodes = np.array(nodes, order="C")  # a writable copy: numba compiles separate code for read-only arrays
@@ -47,12 +43,7 @@ def homes(nodes: Any, points: Any) -> Any:
 
     Each search starts from the node of the previous point; if the points are too far apart, all nodes are tried.
 
-    Parameters
-    ----------
-    nodes : (rows, columns, 3)
-        Grid; columns are periodic.
-    points : (n, 3)
-        Points, consecutive ones close together.
+    Shapes: `nodes` (rows, columns, 3), `points` (n, 3).
     """
     columns = nodes.shape[1]
     home = np.zeros(len(points), dtype=np.int32)

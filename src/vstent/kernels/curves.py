@@ -216,12 +216,9 @@ def roughness(n: int, order: int, strength: Floats | float = 1.0) -> csc_matrix:
 
     Parameters
     ----------
-    n : int
-        Number of samples.
-    order : int
-        Order of the differences.
-    strength : float or (n,)
-        Weight of the differences, possibly for every sample.
+    n : number of samples.
+    order : order of the differences.
+    strength : float or (n,); weight of the differences, possibly for every sample.
     """
     difference = csc_matrix(eye(n))
     for k in range(order):
@@ -235,14 +232,10 @@ def smooth(values: Floats, weight: Floats, strength: Floats | float, order: int 
 
     Parameters
     ----------
-    values : (n,) or (n, d)
-        Samples v.
-    weight : (n,)
-        Weights w.
-    strength : float or (n,)
-        Weight of the differences, possibly for every sample.
-    order : int
-        Order of the differences.
+    values : (n,) or (n, d); samples v.
+    weight : (n,); weights w.
+    strength : float or (n,); weight of the differences, possibly for every sample.
+    order : order of the differences.
 
     References
     ----------

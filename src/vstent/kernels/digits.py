@@ -16,12 +16,9 @@ def text_rows(words: list[str], numbers: Ints, decimals: int) -> bytes:
 
     Parameters
     ----------
-    words : k + 1 texts
-        Text before, between and after the numbers of a row.
-    numbers : (n, k) int
-        Numbers, multiplied by 10^decimals.
-    decimals : int
-        Digits after the point; 0: no point.
+    words : k + 1 texts; text before, between and after the numbers of a row.
+    numbers : (n, k); numbers, multiplied by 10^decimals.
+    decimals : digits after the point; 0: no point.
     """
     parts = [word.encode() for word in [*words[:-1], words[-1] + "\n"]]
     starts = np.cumsum([0, *map(len, parts)])

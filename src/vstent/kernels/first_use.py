@@ -16,11 +16,9 @@ def telling(tell: Callable[[], None], *, helper: Sequence[str] = ()) -> Iterator
 
     Parameters
     ----------
-    tell : callable
-        Called at the first compilation.
-    helper : sequence of str
-        Command of a second process that compiles further kernels until this block ends. Threads of one process cannot
-        compile at the same time, but this process uses whatever the helper has put in numba's cache by then.
+    tell : called at the first compilation.
+    helper : command of a second process that compiles further kernels until this block ends. Threads of one process
+        cannot compile at the same time, but this process uses whatever the helper has put in numba's cache by then.
     """
     once = _Once(tell, tuple(helper))
     try:
@@ -38,10 +36,8 @@ def kept(call: Callable[[], None], command: Sequence[str]) -> None:
 
     Parameters
     ----------
-    call : callable
-        Runs the kernels.
-    command : sequence of str
-        Command of a process that compiles them.
+    call : runs the kernels.
+    command : command of a process that compiles them.
     """
     try:
         with event.install_listener("numba:compile", _Refusal()):

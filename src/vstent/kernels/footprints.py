@@ -83,25 +83,17 @@ def footprints(seen: Any, spacing: Any, axes: Any, geometry: Any, shape: Any) ->
 
     Parameters
     ----------
-    seen : (n, 3)
-        Cell centers relative to the isocenter, mm: right, up, toward the detector.
-    spacing : (n,)
-        Edges of the cells, mm.
-    axes : (3, 3)
-        Right, up and toward the detector as rows in the axes of the cells.
-    geometry : (5,)
-        Pixel, source-detector and source-isocenter distance in mm, row and column of the isocenter.
-    shape : (2,) int
-        Rows and columns of the detector.
+    seen : (n, 3); cell centers relative to the isocenter, mm: right, up, toward the detector.
+    spacing : (n,); edges of the cells, mm.
+    axes : (3, 3); right, up and toward the detector as rows in the axes of the cells.
+    geometry : (5,); pixel, source-detector and source-isocenter distance in mm, row and column of the isocenter.
+    shape : (2,); rows and columns of the detector.
 
     Returns
     -------
-    starts : (n + 1,) int64
-        First entry of every cell.
-    pixels : (m,) int32
-        Pixel number, row * columns + column, of every entry.
-    weights : (m,) float32
-        Length in mm over which a ray to the pixel crosses the cell, averaged over the pixel.
+    starts : (n + 1,) int64; first entry of every cell.
+    pixels : (m,) int32; pixel number, row * columns + column, of every entry.
+    weights : (m,) float32; length in mm over which a ray to the pixel crosses the cell, averaged over the pixel.
     """
     starts = np.zeros(len(seen) + 1, np.int64)
     none, nothing = np.zeros(0, np.int32), np.zeros(0, np.float32)

@@ -14,17 +14,13 @@ def isosurface(field: NDArray[np.float32], level: float) -> tuple[Floats, Ints]:
 
     Parameters
     ----------
-    field : (i, j, k) float32
-        Field.
-    level : float
-        Level.
+    field : (i, j, k) float32; field.
+    level : level.
 
     Returns
     -------
-    vertices : (n, 3)
-        Vertices in index units.
-    faces : (m, 3)
-        Triangles, counter-clockwise seen from the low side.
+    vertices : (n, 3); vertices in index units.
+    faces : (m, 3); triangles, counter-clockwise seen from the low side.
 
     References
     ----------

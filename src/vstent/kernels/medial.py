@@ -74,12 +74,8 @@ def with_terminals(medial: Medial, terminals: Floats, reach: Floats) -> Medial:
 
     Parameters
     ----------
-    medial : Medial
-        The graph.
-    terminals : (t, 3)
-        Points to append.
-    reach : (t,)
-        Distance within which each is joined.
+    terminals : (t, 3); points to append.
+    reach : (t,); distance within which each is joined.
     """
     n = len(medial.points)
     tree = cKDTree(medial.points)
@@ -101,10 +97,7 @@ def cost_graph(medial: Medial, radius_cap: Floats) -> csr_matrix:
 
     Parameters
     ----------
-    medial : Medial
-        The graph.
-    radius_cap : (n,)
-        Upper limit of the radii.
+    radius_cap : (n,); upper limit of the radii.
     """
     radius = np.maximum(np.minimum(medial.radius, radius_cap), 1e-6)
     a, b = medial.edges.T
@@ -119,10 +112,8 @@ def path_to(before: Ints, end: int) -> Ints:
 
     Parameters
     ----------
-    before : (n,) int
-        Predecessor of every vertex, negative at the root.
-    end : int
-        Last vertex.
+    before : (n,); predecessor of every vertex, negative at the root.
+    end : last vertex.
     """
     path = [end]
     while before[path[-1]] >= 0:
@@ -139,12 +130,8 @@ def spheres(samples: Floats, normals: Floats, closed: Tree, ends: Floats) -> Med
 
     Parameters
     ----------
-    samples, normals : (n, 3)
-        Points of the wall and outward normals.
-    closed : Tree
-        The closed surface.
-    ends : (k, 3)
-        Centres of the openings.
+    samples, normals : (n, 3); points of the wall and outward normals.
+    ends : (k, 3); centres of the openings.
     """
     every, touched = voronoi(samples)
     extent = float(np.ptp(samples, axis=0).max())
@@ -186,14 +173,9 @@ def arms(medial: Medial, roots: Ints, least_cost: float, least_radius: float) ->
 
     Parameters
     ----------
-    medial : Medial
-        The graph.
-    roots : (r,) int
-        Vertices of the tree; may be empty.
-    least_cost : float
-        Minimum cost length / radius of a path, that is, its length in radii.
-    least_radius : float
-        Spheres up to this radius may lie between roots but do not form an arm.
+    roots : (r,); vertices of the tree; may be empty.
+    least_cost : minimum cost length / radius of a path, that is, its length in radii.
+    least_radius : spheres up to this radius may lie between roots but do not form an arm.
     """
     graph = cost_graph(medial, np.full(len(medial.radius), np.inf))
     if len(roots):
@@ -237,14 +219,10 @@ def widest_in_section(distance: Any, slope: Any, gain: float, first_step: Any) -
 
     Parameters
     ----------
-    distance : (n, k)
-        Distances from the planes.
-    slope : (n, k, 2)
-        Decrease of the distances with the shift.
-    gain : float
-        Weight of the penalty.
-    first_step : (n,)
-        Length of the first step.
+    distance : (n, k); distances from the planes.
+    slope : (n, k, 2); decrease of the distances with the shift.
+    gain : weight of the penalty.
+    first_step : (n,); length of the first step.
 
     References
     ----------

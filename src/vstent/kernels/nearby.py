@@ -36,14 +36,10 @@ def sums(nodes: Floats, points: Floats, values: Floats, reach: float) -> Floats:
 
     Parameters
     ----------
-    nodes : (n, 3)
-        Nodes.
-    points : (p, 3)
-        Points.
-    values : (p, k)
-        Values of the points.
-    reach : float
-        Distance at which the weight becomes zero.
+    nodes : (n, 3); nodes.
+    points : (p, 3); points.
+    values : (p, k); values of the points.
+    reach : distance at which the weight becomes zero.
     """
     boxes, order = _boxed(nodes, reach)
     result = np.zeros((len(order), values.shape[1]))
@@ -58,14 +54,10 @@ def areas(nodes: Floats, corners: Floats, spacing: float, reach: float) -> Float
 
     Parameters
     ----------
-    nodes : (n, 3)
-        Nodes.
-    corners : (m, 3, 3)
-        Triangles.
-    spacing : float
-        Maximum edge of a part.
-    reach : float
-        Distance at which the weight becomes zero.
+    nodes : (n, 3); nodes.
+    corners : (m, 3, 3); triangles.
+    spacing : maximum edge of a part.
+    reach : distance at which the weight becomes zero.
     """
     boxes, order = _boxed(nodes, reach)
     result = np.zeros(len(order))

@@ -19,14 +19,10 @@ def paint_triangles(screen: Floats, colours: Floats, faces: Ints, depth: Floats,
 
     Parameters
     ----------
-    screen : (n, 3)
-        Vertices in screen coordinates.
-    colours : (n, 3)
-        Colour of every vertex.
-    faces : (m, 3) int
-        Triangles.
-    depth, image
-        Changed in place.
+    screen : (n, 3); vertices in screen coordinates.
+    colours : (n, 3); colour of every vertex.
+    faces : (m, 3); triangles.
+    depth, image : changed in place.
     """
     height, width = depth.shape
     for f in range(len(faces)):
@@ -60,18 +56,12 @@ def paint_wires(
 
     Parameters
     ----------
-    screen : (p, 3)
-        Points of the wires in screen coordinates.
-    starts : (w + 1,) int
-        First point of every wire.
-    radius : (w,)
-        Radius in pixels.
-    pixel : float
-        Size of a pixel in mm. It converts the bulge of a wire towards the eye to depth.
-    colours : (p, 3)
-        Colour of every point.
-    depth, image
-        Changed in place.
+    screen : (p, 3); points of the wires in screen coordinates.
+    starts : (w + 1,); first point of every wire.
+    radius : (w,); radius in pixels.
+    pixel : size of a pixel in mm. It converts the bulge of a wire towards the eye to depth.
+    colours : (p, 3); colour of every point.
+    depth, image : changed in place.
     """
     height, width = depth.shape
     for wire in range(len(radius)):
@@ -105,14 +95,10 @@ def veil_triangles(
 
     Parameters
     ----------
-    screen, colours, faces, depth
-        As in `paint_triangles`; `depth` does not change.
-    alphas : (n,)
-        Opacity of every vertex.
-    sums : (h, w, 4)
-        Alpha times colour, and alpha, are added here.
-    clear : (h, w)
-        Multiplied by 1 - alpha.
+    screen, colours, faces, depth : as in `paint_triangles`; `depth` does not change.
+    alphas : (n,); opacity of every vertex.
+    sums : (h, w, 4); alpha times colour, and alpha, are added here.
+    clear : (h, w); multiplied by 1 - alpha.
 
     References
     ----------
@@ -201,17 +187,11 @@ def resolve(image: Floats, sums: Floats, clear: Floats, supersampling: int) -> F
 
     Parameters
     ----------
-    image : (h, w, 3)
-        Opaque image.
-    sums, clear : (h, w, 4), (h, w)
-        Translucent layers from `veil_triangles`.
-    supersampling : int
-        Edge s of the blocks.
+    image : (h, w, 3); opaque image.
+    sums, clear : (h, w, 4), (h, w); translucent layers from `veil_triangles`.
+    supersampling : edge s of the blocks.
 
-    Returns
-    -------
-    (h / s, w / s, 3)
-        Colours.
+    Returns (h / s, w / s, 3): colours.
     """
     height, width = clear.shape
     result = np.zeros((height // supersampling, width // supersampling, 3))

@@ -20,10 +20,8 @@ def stiffness(vertices: Floats, faces: Ints) -> csc_matrix:
 
     Parameters
     ----------
-    vertices : (n, 3)
-        Vertices.
-    faces : (m, 3) int
-        Triangles.
+    vertices : (n, 3); vertices.
+    faces : (m, 3); triangles.
 
     References
     ----------
@@ -54,14 +52,10 @@ def region(vertices: Floats, faces: Ints, gain: Floats, is_fixed: Bools, reach: 
 
     Parameters
     ----------
-    vertices, faces : (n, 3), (m, 3)
-        The mesh.
-    gain : (n,)
-        Gain per area, in 1 / length. The initial region is where it is positive.
-    is_fixed : (n,) bool
-        Vertices that keep their initial side.
-    reach : float
-        Length over which the border moves in a step; longer than the mesh's edges.
+    vertices, faces : (n, 3), (m, 3); the mesh.
+    gain : (n,); gain per area, in 1 / length. The initial region is where it is positive.
+    is_fixed : (n,); vertices that keep their initial side.
+    reach : length over which the border moves in a step; longer than the mesh's edges.
 
     References
     ----------

@@ -24,14 +24,10 @@ def stencil(index: Any, x: float, y: float, z: float, cells: Any, weights: Any) 
 
     Parameters
     ----------
-    index : (i, j, k) int
-        Cell numbers.
-    x, y, z : float
-        Point.
-    cells : (8,) int
-        Set to the cell numbers, -1 outside.
-    weights : (8,)
-        Set to the weights.
+    index : (i, j, k); cell numbers.
+    x, y, z : point.
+    cells : (8,); set to the cell numbers, -1 outside.
+    weights : (8,); set to the weights.
     """
     i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
     a, b, c = x - i, y - j, z - k
@@ -61,14 +57,11 @@ def interpolate(index: Any, values: Any, points: Any, is_zero_outside: bool) -> 
 
     Parameters
     ----------
-    index : (i, j, k) int
-        Cell numbers.
-    values : (n, d)
-        Field.
-    points : (m, 3)
-        Points.
-    is_zero_outside : bool
-        True: cells outside count as zero, as for a velocity with no slip. False: they are left out, as for a pressure.
+    index : (i, j, k); cell numbers.
+    values : (n, d); field.
+    points : (m, 3); points.
+    is_zero_outside : True: cells outside count as zero, as for a velocity with no slip. False: they are left out, as
+        for a pressure.
     """
     result = np.zeros((len(points), values.shape[1]))
     for m in prange(len(points)):
@@ -157,25 +150,17 @@ def trace_all(index: Any, velocity: Any, seeds: Any, step: float, slowest: float
 
     Parameters
     ----------
-    index : (i, j, k) int
-        Cell numbers.
-    velocity : (n, 3)
-        Velocity field.
-    seeds : (s, 3)
-        First points.
-    step : float
-        Step length in cells; negative: upstream.
-    slowest : float
-        Speed at which a streamline ends.
-    most : int
-        Maximum number of points.
+    index : (i, j, k); cell numbers.
+    velocity : (n, 3); velocity field.
+    seeds : (s, 3); first points.
+    step : step length in cells; negative: upstream.
+    slowest : speed at which a streamline ends.
+    most : maximum number of points.
 
     Returns
     -------
-    path : (s, most, 4)
-        Points and speeds.
-    count : (s,)
-        Number of points of each streamline.
+    path : (s, most, 4); points and speeds.
+    count : (s,); number of points of each streamline.
     """
     path = np.zeros((len(seeds), most, 4))
     count = np.zeros(len(seeds), np.int32)
@@ -219,20 +204,13 @@ def fit_wall(index: Any, distance: Any, velocity: Any, pressure: Any, points: An
 
     Parameters
     ----------
-    index : (i, j, k) int
-        Cell numbers.
-    distance : (n,)
-        Distance of every cell from the wall, in cells.
-    velocity : (n, 3)
-        Velocity field.
-    pressure : (n,)
-        Pressure field.
-    points : (m, 3)
-        Wall points.
-    normals : (m, 3)
-        Inward unit normals.
-    reach : int
-        Radius of the fit, in cells.
+    index : (i, j, k); cell numbers.
+    distance : (n,); distance of every cell from the wall, in cells.
+    velocity : (n, 3); velocity field.
+    pressure : (n,); pressure field.
+    points : (m, 3); wall points.
+    normals : (m, 3); inward unit normals.
+    reach : radius of the fit, in cells.
     """
     result = np.zeros((len(points), 4))
     for m in prange(len(points)):

@@ -28,12 +28,9 @@ def sheet(vertices: Floats, faces: Ints, weights: Floats) -> Sheet:
 
     Parameters
     ----------
-    vertices : (n, 3)
-        Vertices.
-    faces : (m, 3)
-        Vertex indices, with at most two faces at an edge.
-    weights : (m, w)
-        Weights of each face in the sums of areas.
+    vertices : (n, 3); vertices.
+    faces : (m, 3); vertex indices, with at most two faces at an edge.
+    weights : (m, w); weights of each face in the sums of areas.
     """
     edges = np.sort(triangles.directed_edges(faces), axis=1).astype(np.int64)
     key = edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1]
@@ -58,19 +55,14 @@ def beyond(mesh: Sheet, seed: int, points: Floats, normals: Floats) -> tuple[Flo
 
     Parameters
     ----------
-    mesh : Sheet
-        The mesh.
-    seed : int
-        A face of the part.
-    points, normals : (k, 3)
-        A point on each plane, and its unit normal, toward the part.
+    seed : a face of the part.
+    points, normals : (k, 3); a point on each plane, and its unit normal, toward the part.
 
     Returns
     -------
-    measures : (k, 2 + w)
-        Volume of the part closed by the plane, area of its section, and its weighted areas.
-    is_closed : (k,)
-        Whether the plane cuts off a part without open edges of the mesh; without one, the measures are not complete.
+    measures : (k, 2 + w); volume of the part closed by the plane, area of its section, and its weighted areas.
+    is_closed : (k,); whether the plane cuts off a part without open edges of the mesh; without one, the measures are
+        not complete.
     """
     rows = np.ascontiguousarray(points), np.ascontiguousarray(normals)
     return _beyond(*mesh, seed, *rows)

@@ -14,10 +14,8 @@ def averaging(n_vertices: int, faces: Ints) -> csr_array:
 
     Parameters
     ----------
-    n_vertices : int
-        Number of vertices.
-    faces : (m, 3) int
-        Triangles.
+    n_vertices : number of vertices.
+    faces : (m, 3); triangles.
     """
     edges = np.sort(triangles.directed_edges(faces), axis=1).astype(np.int64)
     code, count = np.unique(edges[:, 0] * n_vertices + edges[:, 1], return_counts=True)
@@ -40,14 +38,10 @@ def taubin(vertices: Floats, faces: Ints, *, iterations: int, pass_band: float) 
 
     Parameters
     ----------
-    vertices : (n, 3)
-        Vertices.
-    faces : (m, 3) int
-        Triangles.
-    iterations : int
-        Number of pairs of steps.
-    pass_band : float
-        k_PB: components with a Laplacian eigenvalue (0 to 2) below it are kept.
+    vertices : (n, 3); vertices.
+    faces : (m, 3); triangles.
+    iterations : number of pairs of steps.
+    pass_band : k_PB: components with a Laplacian eigenvalue (0 to 2) below it are kept.
 
     References
     ----------
@@ -69,12 +63,9 @@ def mean_curvature(vertices: Floats, faces: Ints, *, rounds: int) -> Floats:
 
     Parameters
     ----------
-    vertices : (n, 3)
-        Vertices.
-    faces : (m, 3) int
-        Triangles.
-    rounds : int
-        Number of times that the curvature is averaged over neighbouring vertices.
+    vertices : (n, 3); vertices.
+    faces : (m, 3); triangles.
+    rounds : number of times that the curvature is averaged over neighbouring vertices.
     """
     corners, n = vertices[faces], len(vertices)
     normal, double_area = triangles.normals(corners), np.maximum(2 * triangles.areas(corners), 1e-12)

@@ -64,15 +64,12 @@ def without_cracks(vertices: Floats, faces: Ints) -> tuple[Ints, float]:
 
     Parameters
     ----------
-    vertices, faces : (n, 3) and (m, 3)
-        Mesh without equal vertices.
+    vertices, faces : (n, 3) and (m, 3); mesh without equal vertices.
 
     Returns
     -------
-    faces : (m, 3)
-        Faces on the vertices that are kept.
-    width : float
-        Smallest width at which most edges meet; 0 where nothing was merged.
+    faces : (m, 3); faces on the vertices that are kept.
+    width : smallest width at which most edges meet; 0 where nothing was merged.
     """
     edges = edges_of(faces)
     single = edges.starts[edges.n_uses == 1]
@@ -279,10 +276,8 @@ def least_area(polygon: Floats, is_taken: Bools) -> Ints | None:
 
     Parameters
     ----------
-    polygon : (n, 3)
-        Closed polygon.
-    is_taken : (n, n) bool
-        Pairs of vertices between which no chord is allowed.
+    polygon : (n, 3); closed polygon.
+    is_taken : (n, n); pairs of vertices between which no chord is allowed.
 
     References
     ----------

@@ -64,10 +64,8 @@ def curved(tree: Tree, normals: Floats) -> Curved:
 
     Parameters
     ----------
-    tree : Tree
-        Tree over flat triangles.
-    normals : (m, 3, 3)
-        Unit normals at the corners of every face, in the order of the surface.
+    tree : tree over flat triangles.
+    normals : (m, 3, 3); unit normals at the corners of every face, in the order of the surface.
     """
     rise = triangles.edge_rises(tree.corners, normals[tree.face])
     low, high = _boxes(tree.corners, (len(tree.low) + 1) // 2, np.abs(rise).sum(axis=1) / 8)
@@ -232,10 +230,8 @@ def first_hits(tree: Tree, origins: Floats, directions: Floats) -> tuple[Floats,
 
     Parameters
     ----------
-    tree : Tree
-        Tree over the triangles.
-    origins, directions : (n, 3)
-        Origins and unit directions of the rays.
+    tree : tree over the triangles.
+    origins, directions : (n, 3); origins and unit directions of the rays.
     """
     origins, directions = _plain(origins), _plain(directions)
     distance, triangle = _first_hit_all(tree.corners, tree.low, tree.high, origins, directions, np.inf)
@@ -292,12 +288,7 @@ def closest_on_triangle(p: Any, t: Any) -> tuple[float, float, int]:
 
     Features are 0 for the face, 1, 2, 3 for the edges ab, bc, ca, and 4, 5, 6 for the corners a, b, c.
 
-    Parameters
-    ----------
-    p : (3,)
-        Point.
-    t : (3, 3)
-        Corners a, b, c.
+    Shapes: `p` (3,), `t` (3, 3).
 
     References
     ----------

@@ -211,19 +211,14 @@ def clip(vertices: Floats, faces: Ints, level: Floats) -> tuple[Floats, Ints, Fl
 
     Parameters
     ----------
-    vertices, faces : (n, 3), (m, 3)
-        The mesh.
-    level : (n,)
-        Value at every vertex, linear along edges.
+    vertices, faces : (n, 3), (m, 3); the mesh.
+    level : (n,); value at every vertex, linear along edges.
 
     Returns
     -------
-    vertices : (k, 3)
-        Vertices; faces next to each other share those of the cut.
-    faces : (j, 3)
-        Faces.
-    level : (k,)
-        Level at these vertices.
+    vertices : (k, 3); Vertices; faces next to each other share those of the cut.
+    faces : (j, 3); faces.
+    level : (k,); level at these vertices.
     """
     level = np.where(np.abs(level) < 1e-12, 1e-12, level)
     inside = level < 0
@@ -283,12 +278,9 @@ def sample(vertices: Floats, faces: Ints, most: int = 30_000, coarsest: float = 
 
     Parameters
     ----------
-    vertices, faces : (n, 3), (m, 3)
-        The surface.
-    most : int
-        Approximate maximum number of points; it limits how small the spacing is.
-    coarsest : float
-        Spacing wanted; limited to between one and two times the spacing at which there are `most` points.
+    vertices, faces : (n, 3), (m, 3); the surface.
+    most : approximate maximum number of points; it limits how small the spacing is.
+    coarsest : spacing wanted; limited to between one and two times the spacing at which there are `most` points.
     """
     corners = vertices[faces]
     even = float(np.sqrt(areas(corners).sum() / most))

@@ -84,19 +84,12 @@ def bands(anatomy: Anatomy, deployment: Deployment, measures: Measures, *, is_pr
 
     Parameters
     ----------
-    anatomy : Anatomy
-        The artery.
-    deployment : Deployment
-        The deployed device. Its middle row stays where it is.
-    measures : dict
-        Results of `vstent.deployment.measure.measure`.
-    is_proposed : bool, optional
-        Whether to find also the sizes that would be proposed at both ends of the band of the deployed length.
+    deployment : the deployed device. Its middle row stays where it is.
+    measures : results of `vstent.deployment.measure.measure`.
+    is_proposed : whether to find also the sizes that would be proposed at both ends of the band of the deployed
+        length.
 
-    Returns
-    -------
-    Bands
-        Bands of the results in `BANDED` that are measured; none for a device without ranges.
+    Returns bands of the results in `BANDED` that are measured; none for a device without ranges.
     """
     stent = deployment.stent
     ranges = uncertain(stent.design)
@@ -116,22 +109,7 @@ def bands(anatomy: Anatomy, deployment: Deployment, measures: Measures, *, is_pr
 
 
 def length_band(anatomy: Anatomy, deployment: Deployment, measures: Measures) -> Band | None:
-    """Compute the band of the deployed length alone, from fewer samples and without further deployments.
-
-    Parameters
-    ----------
-    anatomy : Anatomy
-        The artery.
-    deployment : Deployment
-        The deployed device.
-    measures : dict
-        Results of `vstent.deployment.measure.measure`.
-
-    Returns
-    -------
-    Band or None
-        The band; None for a device without ranges.
-    """
+    """Compute the band of the deployed length alone, from fewer samples and without further deployments."""
     ranges = uncertain(deployment.stent.design)
     if not ranges:
         return None

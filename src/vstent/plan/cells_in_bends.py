@@ -55,21 +55,10 @@ def plane(anatomy: Anatomy, stent: Stent, measures: Measures, ranges: tuple[Rang
 
     Parameters
     ----------
-    anatomy : Anatomy
-        The artery.
-    stent : Stent
-        The device with the numbers of the catalogue.
-    measures : dict
-        Its results.
-    ranges : tuple of Range
-        Its ranges.
-    landing : Landing
-        Where it is landed.
+    stent : the device with the numbers of the catalogue.
+    landing : where it is landed.
 
-    Returns
-    -------
-    Plane
-        The fit. It has no results if the device fits the artery at fewer than two of the places.
+    Returns the fit. It has no results if the device fits the artery at fewer than two of the places.
     """
     assert isinstance(stent.design, LaserCut)
     varied = [one for one in ranges if one.name in NUMBERS]

@@ -153,15 +153,7 @@ def default_criteria() -> Criteria:
 def read_criteria(path: Path) -> Criteria:
     """Read criteria from a TOML file in the form of ``vstent/plan/criteria.toml``.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    Criteria
-        The criteria.
+    Returns the criteria.
 
     Raises
     ------
@@ -180,15 +172,10 @@ def parse(text: str, name: str = "The file of criteria") -> Criteria:
 
     Parameters
     ----------
-    text : str
-        Content of the file.
-    name : str, optional
-        Name of the file in messages.
+    text : content of the file.
+    name : name of the file in messages.
 
-    Returns
-    -------
-    Criteria
-        The criteria.
+    Returns the criteria.
 
     Raises
     ------

@@ -166,14 +166,7 @@ def alternatives(anatomy: Anatomy, design: Design, size: Size, *, count: int = 2
 
     Parameters
     ----------
-    anatomy : Anatomy
-        The restored artery.
-    design : Design
-        The device.
-    size : Size
-        The chosen size.
-    count : int, optional
-        Largest number of alternatives.
+    count : largest number of alternatives.
     """
     lengths = sorted(
         (one for one in design.sizes if one.diameter_mm == size.diameter_mm), key=lambda one: one.length_mm
@@ -219,15 +212,7 @@ def _graded(common: tuple[Anatomy, Criteria], task: tuple[Design, Size, float]) 
 
 
 def graded_anew(candidate: Candidate, criteria: Criteria) -> Candidate:
-    """Return a candidate with the grades, the score and the reason of its measures.
-
-    Parameters
-    ----------
-    candidate : Candidate
-        A candidate with measures.
-    criteria : Criteria
-        Criteria for grading; those whose measure it lacks are left out.
-    """
+    """Return a candidate with the grades, the score and the reason of its measures."""
     asked = [item for item in criteria.of(candidate.design) if item.key in candidate.measures]
     grades = {item.key: item.grade(float(candidate.measures[item.key])) for item in asked}
     weight = sum(item.weight for item in asked)
@@ -251,22 +236,7 @@ def _length_band(anatomy: Anatomy, deployment: Deployment, measures: Measures) -
 
 
 def landing_measures(anatomy: Anatomy, measures: Measures) -> Measures:
-    """Compute measures for criteria that combine both ends of a device or describe where its ends lie.
-
-    Parameters
-    ----------
-    anatomy : Anatomy
-        The artery.
-    measures : dict
-        Results of `vstent.deployment.measure.measure`.
-
-    Returns
-    -------
-    dict
-        Oversizing relative to the wider landing zone, the bend at the ends, the shorter and the longer length beyond
-        the neck (mm), and the distance from an end to the nearest branch (mm). Numbers that cannot be measured are left
-        out.
-    """
+    """Compute measures for criteria that combine both ends of a device or describe where its ends lie."""
     wider_mm = max(landing_diameters_mm(anatomy))
     ends_mm = np.array([float(measures[f"{end}_end_abscissa_mm"]) for end in ("proximal", "distal")])
     found: Measures = {"landing_oversizing_fraction": float(measures["label_diameter_mm"]) / wider_mm - 1}
@@ -281,18 +251,7 @@ def landing_measures(anatomy: Anatomy, measures: Measures) -> Measures:
 
 
 def bend_ratios(anatomy: Anatomy) -> Floats:
-    """Compute the ratio of the artery's diameter to the radius of its bend along the parent axis.
-
-    Parameters
-    ----------
-    anatomy : Anatomy
-        The artery.
-
-    Returns
-    -------
-    (n,) array
-        Ratio at every point of the axis.
-    """
+    """Compute the ratio of the artery's diameter to the radius of its bend along the parent axis."""
     axis = anatomy.parent.axis
     diameter_mm = 2 * float(np.median(anatomy.parent.section_radius_mm))
     even_mm = curves.resample_evenly(axis.points_mm, len(axis.points_mm))

@@ -72,27 +72,17 @@ def rank_flows(
 
     Parameters
     ----------
-    anatomy : Anatomy
-        The restored artery, with a sac.
-    ranking : Ranking
-        The ranking by geometry.
-    settings : FlowSettings
-        Settings of the flows.
-    count : int
-        Number of candidates that get a flow.
-    has_contrast : bool, optional
-        Whether contrast is carried through the flows, and its retention in the sac counts in the scores.
-    stored : Stored, optional
-        Finished results by candidate; those that are there are not computed again, and new ones are added.
-    progress : callable, optional
-        Called with the number of finished flows, the number of all, and the name of the next.
+    anatomy : the restored artery, with a sac.
+    ranking : the ranking by geometry.
+    settings : settings of the flows.
+    count : number of candidates that get a flow.
+    has_contrast : whether contrast is carried through the flows, and its retention in the sac counts in the scores.
+    stored : finished results by candidate; those that are there are not computed again, and new ones are added.
+    progress : called with the number of finished flows, the number of all, and the name of the next.
 
-    Returns
-    -------
-    Ranking
-        The same candidates in the same order; those with a flow have its changes, its uncertainty and its grade among
-        their measures, and a sentence on it among their reasons. With contrast, those with a retention have new scores
-        and are ordered among the places that they have.
+    Returns the same candidates in the same order; those with a flow have its changes, its uncertainty and its grade
+    among their measures, and a sentence on it among their reasons. With contrast, those with a retention have new
+    scores and are ordered among the places that they have.
 
     Raises
     ------
@@ -207,24 +197,15 @@ def flow_with(
 
     Parameters
     ----------
-    anatomy : Anatomy
-        The restored artery, with a sac.
-    candidate : Candidate or None
-        The candidate; None: no device.
-    settings : FlowSettings
-        Settings of the flow.
-    start : FlowField or None
-        The flow without a device.
-    similar : FlowField or None
-        The flow with a similar device.
-    has_contrast : bool
-        Whether the retention of contrast is measured.
+    anatomy : the restored artery, with a sac.
+    candidate : the candidate; None: no device.
+    settings : settings of the flow.
+    start : the flow without a device.
+    similar : the flow with a similar device.
+    has_contrast : whether the retention of contrast is measured.
 
-    Returns
-    -------
-    tuple of FlowField or None, and callable
-        The flow, and a function that returns its results; None and a function that returns an error message where the
-        flow with a device cannot be computed.
+    Returns the flow, and a function that returns its results; None and a function that returns an error message where
+    the flow with a device cannot be computed.
 
     Raises
     ------

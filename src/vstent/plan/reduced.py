@@ -83,17 +83,7 @@ class Reduced:
     def changed(self, design: Design, size: Size) -> Changed:
         """Compute the device with other numbers.
 
-        Parameters
-        ----------
-        design : Design
-            The altered device.
-        size : Size
-            Its size.
-
-        Returns
-        -------
-        Changed
-            Ends, gaps, coverage and pore density of the reduced model.
+        Returns ends, gaps, coverage and pore density of the reduced model.
         """
         profile = self._profile(design, size)
         places = [0, -1, *mesh_nodes(design, size)]

@@ -21,13 +21,7 @@ CONFIDENCE: Final = 0.95
 
 
 def centered_points(dimensions: int, samples: int) -> Floats:
-    """Return the first points (n, d) of a Sobol sequence, -1 to 1, each in the middle of its stratum.
-
-    Parameters
-    ----------
-    dimensions : number d of uncertain numbers.
-    samples : number n of points; it is rounded up to a power of two.
-    """
+    """Return the first points (n, d) of a Sobol sequence, -1 to 1, each in the middle of its stratum."""
     from scipy.stats.qmc import Sobol  # its import takes a quarter of a second
 
     unit = Sobol(dimensions, scramble=False).random_base2(int(np.ceil(np.log2(samples))))
@@ -40,17 +34,7 @@ def first_order_shares(points: Floats, values: Floats) -> Floats | None:
     Degree 2 is left out if there are fewer than twice as many results as unknowns. A share that so few results cannot
     distinguish from chance (F test) is 0.
 
-    Parameters
-    ----------
-    points : (n, d) array
-        Values of d causes, each scaled to -1 to 1.
-    values : (n,) array
-        Results.
-
-    Returns
-    -------
-    (d,) array or None
-        Fractions, with a sum of at most 1; None if there are too few results.
+    Shapes: `points` (n, d), `values` (n,).
 
     References
     ----------

@@ -42,19 +42,10 @@ def shortening(anatomy: Anatomy, stent: Stent, ranges: tuple[Range, ...], landin
 
     Parameters
     ----------
-    anatomy : Anatomy
-        The artery.
-    stent : Stent
-        The device with the numbers of the catalogue.
-    ranges : tuple of Range
-        Its ranges.
-    landing : Landing
-        Where its middle row lies.
+    stent : the device with the numbers of the catalogue.
+    landing : where its middle row lies.
 
-    Returns
-    -------
-    Shortening
-        The fit; slopes over numbers without a range are 0.
+    Returns the fit; slopes over numbers without a range are 0.
     """
     varied = [one for one in ranges if one.name in NUMBERS]
     devices = [(stent.design, stent.size)]

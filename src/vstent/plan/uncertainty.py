@@ -131,23 +131,13 @@ def vary(
 
     Parameters
     ----------
-    anatomy : Anatomy
-        The artery.
-    deployment : Deployment
-        The deployed device. Its size and the position of its middle row are varied.
-    ranges : Ranges
-        Range of each cause and number of samples.
-    flow : FlowSettings, optional
-        Settings of the flow for the first ``ranges.flow_samples`` samples.
-    progress : callable, optional
-        Called with the number of finished samples and the number of all.
-    checkpoint : Checkpoint, optional
-        Storage for the samples whose flow is computed; an interrupted study resumes after the last of them.
+    deployment : the deployed device. Its size and the position of its middle row are varied.
+    ranges : range of each cause and number of samples.
+    flow : settings of the flow for the first ``ranges.flow_samples`` samples.
+    progress : called with the number of finished samples and the number of all.
+    checkpoint : storage for the samples whose flow is computed; an interrupted study resumes after the last of them.
 
-    Returns
-    -------
-    Uncertainty
-        Results of all samples.
+    Returns results of all samples.
 
     Raises
     ------

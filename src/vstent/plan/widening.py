@@ -18,15 +18,9 @@ def widened(anatomy: Anatomy, diameter_mm: float) -> Anatomy:
 
     Parameters
     ----------
-    anatomy : Anatomy
-        The artery.
-    diameter_mm : float
-        Increase of every diameter, in mm; negative values shrink the artery.
+    diameter_mm : increase of every diameter, in mm; negative values shrink the artery.
 
-    Returns
-    -------
-    Anatomy
-        The wider artery.
+    Returns the wider artery.
     """
     half_mm, vessel = 0.5 * diameter_mm, anatomy.vessel
     lumen, landing = (_moved_out(surface, half_mm) for surface in (vessel.lumen, anatomy.parent.landing_surface))

@@ -30,19 +30,12 @@ def spread(
 
     Parameters
     ----------
-    work : callable
-        Function at the top level of a module.
-    common : object
-        Data that all items need, sent to every process once.
-    items : sequence
-        Items to work on.
-    jobs : int, optional
-        Number of processes; with 1 the work is done in this process.
+    work : function at the top level of a module.
+    common : object; data that all items need, sent to every process once.
+    items : sequence; items to work on.
+    jobs : number of processes; with 1 the work is done in this process.
 
-    Yields
-    ------
-    object
-        Result for each item.
+    Yields result for each item.
 
     Raises
     ------

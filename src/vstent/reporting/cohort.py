@@ -90,10 +90,7 @@ def cohort_report(name: str, rows: Sequence[Row], pictures: Mapping[tuple[str, s
     rows : one row per case and treatment, with ``case``, ``treatment``, ``outcome``, ``stage``, ``sentence``, metrics.
     pictures : pictures of the deployed treatments as WebP, by case and treatment.
 
-    Returns
-    -------
-    str
-        HTML.
+    Returns HTML.
     """
     from jinja2 import Environment, PackageLoader
 
@@ -151,14 +148,7 @@ def modified_z_scores(values: Sequence[float]) -> list[float]:
     It is the distance from the median divided by the median absolute deviation, scaled to the standard deviation of
     a normal distribution.
 
-    Parameters
-    ----------
-    values : (n,) values of one metric.
-
-    Returns
-    -------
-    list of float
-        (n,) signed scores; all 0 where the median absolute deviation is 0.
+    Shapes: `values` (n,).
 
     References
     ----------
@@ -173,14 +163,7 @@ def modified_z_scores(values: Sequence[float]) -> list[float]:
 
 
 def outliers(rows: Sequence[Row], treatment: str, key: str) -> list[Outlier]:
-    """Return the outliers of one metric of one treatment, the farthest from the median first.
-
-    Parameters
-    ----------
-    rows : rows of the cohort table.
-    treatment : name of the treatment.
-    key : column of the metric.
-    """
+    """Return the outliers of one metric of one treatment, the farthest from the median first."""
     found = _values(rows, treatment, key)
     scores = modified_z_scores([value for _, value in found])
     median = format_value(_leaf(key), float(np.median([value for _, value in found]))) if found else ""

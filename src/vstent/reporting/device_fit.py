@@ -27,10 +27,7 @@ def picture(fitted: Fitted, title: str) -> bytes:
 
     Parameters
     ----------
-    fitted : Fitted
-        The fit.
-    title : str
-        Name of the device.
+    title : name of the device.
     """
     from matplotlib.figure import Figure
 

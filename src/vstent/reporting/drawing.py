@@ -19,13 +19,7 @@ Found = TypeVar("Found")
 
 
 def in_threads(call: Callable[[Item], Found], items: Iterable[Item]) -> list[Found]:
-    """Return the results of a call for every item, computed on as many threads as the kernels use.
-
-    Parameters
-    ----------
-    call : what is computed; most of its time must be spent in code that lets other threads run.
-    items : its arguments.
-    """
+    """Return the results of a call for every item, computed on as many threads as the kernels use."""
     with ThreadPoolExecutor(config.NUMBA_NUM_THREADS) as pool:
         return list(pool.map(call, items))
 

@@ -157,10 +157,7 @@ def draw(layers: tuple[MeshLayer | LineLayer, ...], scene: Scene, view: View, si
     view : direction, center and radius of the view.
     size_px : width and height of the image in pixels.
 
-    Returns
-    -------
-    Floats
-        (height, width, 3) red, green and blue, 0 to 1.
+    Returns (height, width, 3) red, green and blue, 0 to 1.
     """
     width, height = (n * _SUPERSAMPLING for n in size_px)
     pixel = span_mm(view, size_px) / width
@@ -259,13 +256,7 @@ def _contour(scene: Scene) -> Plate:
 
 
 def gap_view(contour: MeshLayer, profile: View) -> View:
-    """Return the view of a contour from the side where it is farthest from the wall.
-
-    Parameters
-    ----------
-    contour : contour of a device with its gaps as values.
-    profile : the view whose upward direction is kept as far as possible.
-    """
+    """Return the view of a contour from the side where it is farthest from the wall."""
     normals = contour.surface.vertex_normals
     # A high power of the gap leaves the place of the largest one, and is smooth where several are equal.
     toward = ((contour.values / contour.values.max()) ** 8) @ normals

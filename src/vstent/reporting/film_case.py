@@ -36,10 +36,7 @@ def film_case(
     progress : called at every stage.
     study : fields of patient and study for the DICOM files; None: none.
 
-    Returns
-    -------
-    dict
-        Angiograms by name of the flow, ``bare`` first.
+    Returns angiograms by name of the flow, ``bare`` first.
 
     Raises
     ------

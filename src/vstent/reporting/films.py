@@ -72,15 +72,7 @@ def shown_of(
     titles: Mapping[str, str],
     settings: FilmSettings,
 ) -> dict[str, Shown]:
-    """Film the contrast of every flow along one direction.
-
-    Parameters
-    ----------
-    histories : contrast by name of the flow, ``bare`` first.
-    stents : implants by treatment.
-    titles : titles of the films by name.
-    settings : how films are taken; without a direction they are frontal (`vstent.angiography.filming.aimed`).
-    """
+    """Film the contrast of every flow along one direction."""
     view = view_for(histories, settings)
     projectors = projectors_of(view, histories)
     found = {}
@@ -125,10 +117,6 @@ def key_times_s(before: Film) -> tuple[tuple[str, float], ...]:
     """Return title and time of the key frames: early, peak, late, and 5 s after the peak where the film is that long.
 
     The peak is the frame with the most contrast in the picture, early and late those with half of it.
-
-    Parameters
-    ----------
-    before : the film without a device.
     """
     total = before.absorption.sum(axis=(1, 2), dtype=np.float64)
     peak = int(np.argmax(total))
@@ -188,12 +176,7 @@ class Density:
 
 
 def density_picture(densities: Sequence[Density]) -> Picture:
-    """Return the picture of the contrast in sac and parent artery over time.
-
-    Parameters
-    ----------
-    densities : the flow without a device first.
-    """
+    """Return the picture of the contrast in sac and parent artery over time."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.2, 3.0), facecolor="white", layout="constrained")
@@ -220,20 +203,7 @@ def write_films(
     *,
     study: Mapping[str, Any] | None = None,
 ) -> list[str]:
-    """Write films into a folder: PNG frames and a DICOM file of each, and one animation of all side by side.
-
-    Parameters
-    ----------
-    out : the folder.
-    shown : films by name, ``bare`` first.
-    densities : contrast over time, for the report.
-    study : fields of patient and study for the DICOM files (`vstent.io.xa_writer.study_of`); None: none.
-
-    Returns
-    -------
-    list of str
-        Names of what was written, relative to `out`.
-    """
+    """Write films into a folder: PNG frames and a DICOM file of each, and one animation of all side by side."""
     films = list(shown.values())
     window = window_of([one.film for one in films])
     written = []
@@ -288,15 +258,7 @@ def _stored(levels: Sequence[NDArray[np.float32]]) -> NDArray[np.uint16]:
 
 
 def header_of(one: Shown, window: float, number: int, study: dict[str, Any]) -> XaHeader:
-    """Return the DICOM header of a film.
-
-    Parameters
-    ----------
-    one : the film.
-    window : absorption that is shown black.
-    number : number of the series.
-    study : fields of patient and study; empty: none.
-    """
+    """Return the DICOM header of a film."""
     view = one.film.view
     return XaHeader(
         primary_rad=view.primary_rad,

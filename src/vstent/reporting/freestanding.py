@@ -25,14 +25,7 @@ TILT: Final = 0.25
 
 
 def freestanding_plate(stents: Mapping[str, Stent], scene: Scene, anatomy: Anatomy) -> Plate:
-    """Return the picture of devices outside an artery, to be drawn.
-
-    Parameters
-    ----------
-    stents : deployed devices by title; the same sizes are drawn.
-    scene : scene of the case, whose style is kept.
-    anatomy : vessel, parent artery and sacs.
-    """
+    """Return the picture of devices outside an artery, to be drawn."""
     layers = [wire_layer(free_device(stent.design, stent.size)) for stent in stents.values()]
     axes = np.array([[1.0, 0, 0], [0, np.cos(TILT), np.sin(TILT)], [0, -np.sin(TILT), np.cos(TILT)]])
     axes = axes @ np.array([[np.cos(TILT), 0, np.sin(TILT)], [0, 1, 0], [-np.sin(TILT), 0, np.cos(TILT)]])
@@ -49,26 +42,14 @@ def freestanding_plate(stents: Mapping[str, Stent], scene: Scene, anatomy: Anato
 
 
 def free_device(design: Design, size: Size) -> Stent:
-    """Return a device at its free diameter, along the x axis.
-
-    Parameters
-    ----------
-    design : the device.
-    size : its size.
-    """
+    """Return a device at its free diameter, along the x axis."""
     length_mm = LONGER * size.length_mm
     tube = straight_tube(0.5 * ROOM * widest_mm(design, size), length_mm)
     return sketch(bed(design, size, tube), Landing(0.5 * length_mm)).stent
 
 
 def straight_tube(radius_mm: float, length_mm: float) -> Anatomy:
-    """Return a straight tube along the x axis, without a sac.
-
-    Parameters
-    ----------
-    radius_mm : its radius.
-    length_mm : its length.
-    """
+    """Return a straight tube along the x axis, without a sac."""
     along = np.linspace(0.0, length_mm, max(8, round(length_mm / 0.2)))
     turn = np.linspace(0.0, 2 * np.pi, COLUMNS, endpoint=False)
     ring = radius_mm * np.stack([0 * turn, np.cos(turn), np.sin(turn)], axis=1)

@@ -71,12 +71,7 @@ def _chip(picture: "Picture", box: tuple[int, int, int, int]) -> None:
 def color_bar(picture: "Picture", colors: Floats, span: tuple[float, float], words: str) -> None:
     """Draw a color bar with ticks at the foot of a picture.
 
-    Parameters
-    ----------
-    picture : the picture.
-    colors : (n, 3) colors from the lowest to the highest value, 0 to 1.
-    span : lowest and highest value.
-    words : title above the bar.
+    Shapes: `colors` (n, 3).
     """
     from PIL import Image, ImageDraw
 

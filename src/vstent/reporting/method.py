@@ -54,15 +54,7 @@ _WALL: Final = (0.62, 0.68, 0.73)
 def method_plates(
     anatomy: Anatomy, implants: Implants, scene: Scene, whole: Vessel | None = None
 ) -> list[Plate | NodeRule]:
-    """Return the pictures of the steps from the patient's artery to the deployed devices, in that order, to be drawn.
-
-    Parameters
-    ----------
-    anatomy : vessel, parent artery and sacs.
-    implants : deployed implants by treatment and id.
-    scene : the scene of the case.
-    whole : the vessel before it was trimmed; None: it is not shown.
-    """
+    """Return the pictures of the steps from the patient's artery to the deployed devices, in that order."""
     found: list[Plate | NodeRule] = []
     if whole is not None and _is_trimmed(whole, anatomy):
         found.append(_trimming(whole, scene))
@@ -201,9 +193,7 @@ def _middle_mm(anatomy: Anatomy) -> Floats:
 def mesh_layers(nodes_mm: Floats) -> tuple[MeshLayer | LineLayer, ...]:
     """Return a contour as a surface and the edges of its triangles as lines.
 
-    Parameters
-    ----------
-    nodes_mm : (rows, columns, 3) nodes.
+    Shapes: `nodes_mm` (rows, columns, 3).
     """
     rows, columns = nodes_mm.shape[:2]
     surface = Surface(nodes_mm.reshape(-1, 3), tube_faces(rows, columns))

@@ -135,13 +135,7 @@ class Contents:
 
 
 def contents_of(case: "CaseResult", drawing: Drawing | None = None) -> Contents:
-    """Return the contents of the report of a case, with all pictures rendered.
-
-    Parameters
-    ----------
-    case : the finished case.
-    drawing : its pictures, if they are being drawn already.
-    """
+    """Return the contents of the report of a case, with all pictures rendered."""
     with drawing or Drawing() as drawn:
         scene, metrics = drawn.begin(case), case.metrics
         pictures = drawn.pictures()

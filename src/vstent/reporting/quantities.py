@@ -143,17 +143,7 @@ class Change(NamedTuple):
 
 
 def base_of(key: str) -> tuple[str, str]:
-    """Return the key that defines a metric, and the text to append to its name.
-
-    Parameters
-    ----------
-    key : key of a metric, of a ratio, or of one of several openings.
-
-    Returns
-    -------
-    tuple of str
-        Key in `DEFINITIONS` (or the key itself), and a suffix such as ``, after / before``.
-    """
+    """Return the key that defines a metric, and the text to append to its name."""
     if key in DEFINITIONS:
         return key, ""
     if key.endswith(RATIO):

@@ -151,14 +151,7 @@ Implants = Mapping[str, Mapping[str, Deployment]]
 
 
 def scene_of(anatomy: Anatomy, implants: Implants, fields: Mapping[str, FlowField]) -> Scene:
-    """Return the scene of a case, decimated to the resolution of a screen.
-
-    Parameters
-    ----------
-    anatomy : vessel, sacs and paths.
-    implants : deployed implants by treatment and id.
-    fields : flows by treatment, ``bare`` first; empty: no flow is shown.
-    """
+    """Return the scene of a case, decimated to the resolution of a screen."""
     treatments = tuple((name, treatment_title(deployed)) for name, deployed in implants.items())
     layers: list[MeshLayer | LineLayer] = anatomy_layers(anatomy)
     for name, deployed in implants.items():
@@ -293,13 +286,7 @@ def device_layers(name: str, deployment: Deployment, anatomy: Anatomy) -> list[M
 
 
 def coverage_layer(name: str, stent: Stent) -> MeshLayer:
-    """Return the contour of a device colored by the local metal coverage in percent.
-
-    Parameters
-    ----------
-    name : pane that shows it.
-    stent : the deployed device.
-    """
+    """Return the contour of a device colored by the local metal coverage in percent."""
     values = 100 * node_coverage(stent).ravel()
     return MeshLayer(id="coverage", pane=name, colour=_STEEL, scale="coverage", values=values, surface=stent.contour)
 
@@ -313,10 +300,7 @@ def node_coverage(stent: Stent) -> Floats:
     ----------
     stent : the deployed device.
 
-    Returns
-    -------
-    Floats
-        (rows, columns) fraction of the surface covered by metal, 0 to 1.
+    Returns (rows, columns) fraction of the surface covered by metal, 0 to 1.
     """
     from scipy.ndimage import uniform_filter
 

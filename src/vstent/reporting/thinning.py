@@ -20,10 +20,8 @@ def thin_surface(surface: Surface, n_faces: int) -> tuple[Surface, Ints]:
 
     Returns
     -------
-    surface : Surface
-        The decimated surface, or the given one where it is small enough.
-    origin : Ints
-        (n,) nearest vertex of the given surface for every new vertex.
+    surface : the decimated surface, or the given one where it is small enough.
+    origin : (n,) nearest vertex of the given surface for every new vertex.
     """
     if len(surface.faces) <= n_faces:
         return surface, np.arange(len(surface.vertices_mm), dtype=np.int32)
@@ -40,17 +38,7 @@ def thin_surface(surface: Surface, n_faces: int) -> tuple[Surface, Ints]:
 def thin_lines(points: Floats, starts: Ints, values: Floats, n_points: int) -> tuple[Floats, Ints, Floats]:
     """Return polylines reduced to about `n_points` points: every k-th point and the last of each line.
 
-    Parameters
-    ----------
-    points : (p, 3) points of all polylines, one after another.
-    starts : (w + 1,) index of the first point of every polyline, and p at the end.
-    values : (p,) value per point, or (0,).
-    n_points : number of points to keep, approximately.
-
-    Returns
-    -------
-    points, starts, values
-        The reduced arrays.
+    Shapes: `points` (p, 3), `starts` (w + 1,), `values` (p,).
     """
     step = max(1, -(-len(points) // n_points))
     kept = [np.append(np.arange(a, b - 1, step), b - 1) for a, b in itertools.pairwise(starts)]
@@ -60,18 +48,7 @@ def thin_lines(points: Floats, starts: Ints, values: Floats, n_points: int) -> t
 
 
 def some_frames(deployment: Deployment, n_frames: int) -> Ints:
-    """Return the indices of evenly spaced contours of an expansion, including the first and the last.
-
-    Parameters
-    ----------
-    deployment : the deployment with its history.
-    n_frames : largest number of contours.
-
-    Returns
-    -------
-    Ints
-        (f,) indices into the history.
-    """
+    """Return the indices of evenly spaced contours of an expansion, including the first and the last."""
     last = len(deployment.history_mm) - 1
     return np.unique(np.linspace(0, last, min(n_frames, last + 1)).astype(int))
 
@@ -81,19 +58,6 @@ def thin_frames(deployment: Deployment, landing_surface: Surface, n_frames: int)
 
     The gap of an earlier contour is its distance to the wall, reduced by the part of that distance that belongs to the
     device at the deployed node.
-
-    Parameters
-    ----------
-    deployment : the deployment with its history.
-    landing_surface : wall of the parent artery that the device expands against.
-    n_frames : largest number of contours.
-
-    Returns
-    -------
-    frames_mm : Floats
-        (f, nodes, 3) contours, the deployed one last.
-    gaps_mm : Floats
-        (f, nodes) gaps to the wall.
     """
     nodes = deployment.stent.nodes_mm.reshape(-1, 3)
     gaps = deployment.wall_gap_mm.ravel()

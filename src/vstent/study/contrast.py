@@ -50,10 +50,7 @@ def angiograms(
     progress : called at every stage.
     record : returns what watches the frames of a flow (see `Record`).
 
-    Returns
-    -------
-    dict
-        Angiograms by name of the flow, ``bare`` first.
+    Returns angiograms by name of the flow, ``bare`` first.
 
     Raises
     ------
@@ -184,13 +181,7 @@ def add_measures(metrics: dict[str, Any], measures: Mapping[str, Mapping[str, fl
 
 
 def kept_measures(out: Path, keys: Mapping[str, Key]) -> dict[str, dict[str, float]]:
-    """Return the measures of the angiograms in a case folder that belong to the flows of a run, by name.
-
-    Parameters
-    ----------
-    out : the case folder.
-    keys : keys of the run's stages.
-    """
+    """Return the measures of the angiograms in a case folder that belong to the flows of a run, by name."""
     try:
         flows = json.loads((out / FOLDER / NUMBERS).read_text(encoding="utf-8"))["flows"]
         own = {name: str(key) for name, key in _flow_keys(keys).items()}

@@ -34,10 +34,7 @@ def truth(case: CaseResult) -> list[Row]:
     ----------
     case : study of the scan that `write_scan` writes.
 
-    Returns
-    -------
-    list of Row
-        Title, found value, true value and unit.
+    Returns title, found value, true value and unit.
     """
     phantom = demo_phantom()
     found_mm, true_mm = _radii_mm(case, phantom)

@@ -45,10 +45,7 @@ def export_openfoam(
 
     Returns
     -------
-    case : FlowCase
-        The flow problem.
-    written : FoamCase
-        The files of the OpenFOAM case.
+    written : the files of the OpenFOAM case.
 
     Raises
     ------

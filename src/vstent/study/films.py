@@ -34,15 +34,7 @@ class Recording:
     def __call__(
         self, name: str, flow: Key, store: Store, carrier_of: Callable[[], FlowField | None]
     ) -> Iterator[Watch | None]:
-        """Yield what watches the frames of a flow, or None where they are stored.
-
-        Parameters
-        ----------
-        name : name of the flow.
-        flow : its key. The contrast is stored under it, so that it is found without the injection.
-        store : results of the case.
-        carrier_of : returns the flow, None where there is none.
-        """
+        """Yield what watches the frames of a flow, or None where they are stored."""
         stage, key = f"contrast {name}", str(angiogram_key(flow, self.settings))
         kept = store.peek(stage, flow, History)
         kept = kept if kept is not None and kept.key == key else None

@@ -90,14 +90,7 @@ def refuse_other_input(out: Path, source: str) -> None:
 
 
 def refuse_other_anatomy(out: Path, settings: Settings, former: Settings | None = None) -> None:
-    """Raise InputError where a case folder holds results of an anatomy found with other settings.
-
-    Parameters
-    ----------
-    out : the case folder.
-    settings : settings of the new run.
-    former : settings of the earlier run; None: they are read from the folder.
-    """
+    """Raise InputError where a case folder holds results of an anatomy found with other settings."""
     former = former or former_settings(out)
     if former is None:
         return

@@ -84,14 +84,7 @@ def implant_keys(anatomy: Key, treatment: Treatment) -> dict[str, Key]:
 
 
 def flow_key(anatomy: Key, implants: Iterable[Key], flow: "FlowSettings") -> Key:
-    """Return the key of one flow.
-
-    Parameters
-    ----------
-    anatomy : key of the anatomy.
-    implants : keys of the implants of the treatment; none in the bare artery.
-    flow : settings of the flow.
-    """
+    """Return the key of one flow."""
     deployed = list(implants)
     unused = () if deployed else ("vstent.deployment",)
     if flow.numerics.engine == LATTICE:

@@ -59,13 +59,7 @@ def take_away_results(out: Path) -> None:
 
 
 def take_away_study(out: Path, kept: Collection[Path]) -> None:
-    """Remove the results of a study with other settings.
-
-    Parameters
-    ----------
-    out : the case folder.
-    kept : OpenFOAM folders that stay, because their computation can be resumed.
-    """
+    """Remove the results of a study with other settings."""
     _take_away(out, OF_STUDY, [key for key in out.glob(f"treatments/*/flow/*/{KEY}") if key.parent not in kept])
 
 
@@ -86,14 +80,7 @@ def _take_away(out: Path, patterns: Iterable[str], keys: Iterable[Path]) -> None
 
 
 def write_vessel(out: Path, vessel: Vessel, *axes: Centerline) -> None:
-    """Write the wall, the centerlines (and further axes) and the openings.
-
-    Parameters
-    ----------
-    out : the case folder.
-    vessel : the vessel.
-    axes : further lines for ``centerlines.vtp``.
-    """
+    """Write the wall, the centerlines (and further axes) and the openings."""
     out.mkdir(parents=True, exist_ok=True)
     writers.write_surface(out / "vessel.vtp", vessel.lumen)
     writers.write_centerlines(out / "centerlines.vtp", (*vessel.centerlines, *axes))
@@ -119,18 +106,7 @@ def write_anatomy(out: Path, anatomy: Anatomy) -> None:
 
 
 def write_implant(folder: Path, deployment: Deployment) -> str:
-    """Write contour, wires and struts of a deployed implant.
-
-    Parameters
-    ----------
-    folder : the folder to write.
-    deployment : the deployment.
-
-    Returns
-    -------
-    str
-        A sentence with the numbers of wires and triangles.
-    """
+    """Write contour, wires and struts of a deployed implant."""
     stent = deployment.stent
     folder.mkdir(parents=True, exist_ok=True)
     writers.write_surface(folder / "contour.vtp", stent.contour, {"wall_gap_mm": deployment.wall_gap_mm.ravel()})

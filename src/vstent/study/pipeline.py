@@ -188,10 +188,8 @@ def restore_vessel(
 
     Returns
     -------
-    anatomy : Anatomy
-        Vessel, parent artery and sacs.
-    measures : dict
-        Morphology; the end of each key is its unit.
+    anatomy : vessel, parent artery and sacs.
+    measures : Morphology; the end of each key is its unit.
 
     Raises
     ------

@@ -28,10 +28,7 @@ def provenance(path: Path, source: str, settings: Settings) -> dict[str, Any]:
     source : its SHA-256.
     settings : settings of the study.
 
-    Returns
-    -------
-    dict
-        Versions, machine, devices, input with its hash, and settings.
+    Returns versions, machine, devices, input with its hash, and settings.
     """
     return {
         "layout": LAYOUT,

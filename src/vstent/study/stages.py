@@ -135,13 +135,6 @@ def find_vessel(path: Path, settings: Settings, store: Store, keys: Mapping[str,
     """Read, segment, repair and trace; a result stored for this input is returned without computation.
 
     The store keeps the result in memory until its `settle` writes it.
-
-    Parameters
-    ----------
-    path : a scan or a surface.
-    settings : settings of the study.
-    store : results of the study.
-    keys : keys of its stages, of `vstent.study.keys`.
     """
     kept = store.find(VESSEL, keys[VESSEL], Vessel)
     if kept is not None:
@@ -170,20 +163,6 @@ def deploy_all(
     anatomy: Anatomy, settings: Settings, store: Store, keys: Mapping[str, Key]
 ) -> tuple[dict[str, dict[str, Deployment]], dict[str, str]]:
     """Deploy the implants of every treatment in the given or the proposed sizes; stored ones are not computed again.
-
-    Parameters
-    ----------
-    anatomy : vessel, sacs and paths.
-    settings : settings of the study.
-    store : results of the study; it keeps new deployments in memory until its `settle` writes them.
-    keys : keys of its stages.
-
-    Returns
-    -------
-    implants : dict
-        Deployed implants by treatment and id.
-    failures : dict
-        Reasons by the name of each treatment that could not be deployed.
 
     Raises
     ------
@@ -288,11 +267,6 @@ def size_of(implant: Implant, anatomy: Anatomy) -> Size:
 def check_inflow(anatomy: Anatomy, flow: FlowSettings | None) -> None:
     """Refuse a mean inflow that no artery has, because it is probably in another unit.
 
-    Parameters
-    ----------
-    anatomy : vessel with its inlets.
-    flow : settings of the flow; None: no flow is computed.
-
     Raises
     ------
     InputError
@@ -329,22 +303,6 @@ def compute_flows(
     """Compute the flow in the bare artery and with every treatment; each is stored as soon as it is finished.
 
     With a GPU it is stored while the next one is computed.
-
-    Parameters
-    ----------
-    out : the case folder.
-    anatomy : vessel, sacs and paths.
-    implants : deployed implants by treatment and id.
-    settings : settings of the study.
-    store : results of the study.
-    keys : keys of its stages.
-
-    Returns
-    -------
-    fields : dict
-        Flows by treatment, ``bare`` first.
-    failures : dict
-        Reasons by the name of each treatment whose flow could not be computed.
 
     Raises
     ------
@@ -408,18 +366,7 @@ def compute_flow(
     progress: OnProgress,
     unfinished: Unfinished,
 ) -> FlowField:
-    """Compute one flow; an unfinished one resumes.
-
-    Parameters
-    ----------
-    anatomy : vessel, sacs and paths.
-    stents : the deployed implants of the treatment; none in the bare artery.
-    settings : settings of the flow.
-    start : the flow in the bare artery, where it is known.
-    folder : folder of the engine's own files.
-    progress : called at every check.
-    unfinished : saved states of its runs.
-    """
+    """Compute one flow; an unfinished one resumes."""
     case = flow_case(anatomy, stents, settings)
     return simulate_case(case, start=start, folder=folder, progress=progress, checkpoint=unfinished)
 
@@ -464,21 +411,7 @@ def vary_all(
     store: Store,
     keys: Mapping[str, Key],
 ) -> dict[str, dict[str, Any]]:
-    """Vary the uncertain inputs of every treatment with one implant.
-
-    Parameters
-    ----------
-    anatomy : vessel, sacs and paths.
-    implants : deployed implants by treatment and id.
-    settings : settings of the study.
-    store : results of the study.
-    keys : keys of its stages.
-
-    Returns
-    -------
-    dict
-        Uncertainty metrics by treatment; empty without an uncertainty study.
-    """
+    """Vary the uncertain inputs of every treatment with one implant."""
     if settings.uncertainty is None:
         return {}
     flow = settings.flow if settings.uncertainty.flow_samples else None
@@ -513,17 +446,7 @@ def measure_study(
     varied: Mapping[str, Any],
     failures: Mapping[str, str],
 ) -> dict[str, Any]:
-    """Return all metrics of a study: of vessel, implants and flows, with bands, uncertainties and failures.
-
-    Parameters
-    ----------
-    anatomy : vessel, sacs and paths.
-    implants : deployed implants by treatment and id.
-    fields : flows by treatment, ``bare`` first.
-    settings : settings of the study.
-    varied : uncertainty metrics by treatment.
-    failures : reasons why a treatment was not deployed or its flow not computed, by name.
-    """
+    """Return all metrics of a study: of vessel, implants and flows, with bands, uncertainties and failures."""
     metrics = measure_all(anatomy, implants, fields, settings.flow)
     band_all(anatomy, implants, metrics, settings)
     for name, spread in varied.items():
@@ -537,21 +460,7 @@ def measure_all(
     fields: Mapping[str, FlowField],
     settings: FlowSettings | None = None,
 ) -> dict[str, Any]:
-    """Return the metrics of the vessel and of every treatment.
-
-    Parameters
-    ----------
-    anatomy : vessel, sacs and paths.
-    implants : deployed implants by treatment and id.
-    fields : flows by treatment, ``bare`` first.
-    settings : settings of the flows; None: the default.
-
-    Returns
-    -------
-    dict
-        ``vessel`` and ``treatments.NAME.{implants.ID,flow,change,quality}``; the end of each key is its unit. The
-        treatment ``bare`` is there where flows are; ``quality`` is the grade of a flow.
-    """
+    """Return the metrics of the vessel and of every treatment."""
     sac = anatomy.aneurysms[0] if anatomy.aneurysms else None
     shapes = (sac.sac, ostium(sac, anatomy.vessel.lumen)) if sac else ()
     treatments: dict[str, dict[str, Any]] = {BARE: {}} if fields else {}
@@ -578,15 +487,7 @@ def band_all(
     metrics: dict[str, Any],
     settings: Settings,
 ) -> None:
-    """Add to the metrics of every implant the bands from the ranges of its device, and how sure the device is.
-
-    Parameters
-    ----------
-    anatomy : vessel, sacs and paths.
-    implants : deployed implants by treatment and id.
-    metrics : result of `measure_all`; every implant gets the entry ``bands``.
-    settings : settings of the study, with the sizes that were given.
-    """
+    """Add to the metrics of every implant the bands from the ranges of its device, and how sure the device is."""
     for treatment in settings.treatments:
         for implant in treatment.implants if treatment.name in implants else ():
             measures = metrics["treatments"][treatment.name]["implants"][implant.id]

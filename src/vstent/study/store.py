@@ -113,12 +113,7 @@ class Store:
         return tell
 
     def foretell(self, keys: Mapping[str, Key]) -> None:
-        """Report in one sentence which results were computed by other code, and how long computing them again takes.
-
-        Parameters
-        ----------
-        keys : keys of the present code by name of the result.
-        """
+        """Report in one sentence which results were computed by other code, and how long computing them again takes."""
         seconds: dict[str, float] = {}
         names = []
         for name, key in keys.items():
@@ -252,14 +247,7 @@ class Store:
         self.write(name, key, {name: self.seconds[name]}, files=states_of(folder, files))
 
     def compute_once(self, name: str, key: Key, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """Return the plain values of a stage, computed unless they are stored under this key; their order is kept.
-
-        Parameters
-        ----------
-        name : name of the stage.
-        key : key of the values.
-        compute : computes them.
-        """
+        """Return the plain values of a stage, computed unless they are stored under this key; their order is kept."""
         record = self.record(name, key)
         if isinstance(record.get("values"), dict):
             self._tell_done(name, record)

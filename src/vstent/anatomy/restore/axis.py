@@ -95,17 +95,6 @@ class Mouth(NamedTuple):
 def fit_axis(lumen: Surface, line: Centerline, mouths: Sequence[Mouth] = ()) -> Tube:
     """Fit axis and radius of the artery along a centerline, ignoring sacs and branches.
 
-    Parameters
-    ----------
-    lumen : wall of the vessel.
-    line : centerline from which the fit starts.
-    mouths : mouth of each sac. Under a mouth the radius is interpolated between the healthy stations on both sides,
-        because the remaining wall flares into the neck.
-
-    Returns
-    -------
-    tube : axis with a spacing of 0.25 mm, and its oval sections.
-
     Raises
     ------
     VesselError
@@ -227,15 +216,7 @@ def _throat_beside(tube: Tube, neck: _Neck, healthy: Bools) -> Bools:
 def section_rays(lumen: Surface, points_mm: Floats, n_rays: int) -> Floats:
     """Return the distance from axis points to the wall along the rays of their sections.
 
-    Parameters
-    ----------
-    lumen : wall of the vessel.
-    points_mm : (n, 3) axis points in mm.
-    n_rays : number of rays in a section.
-
-    Returns
-    -------
-    distance : (n, n_rays) distance in mm; inf where a ray leaves through an opening.
+    Shapes: `points_mm` (n, 3).
     """
     directions = section_directions(points_mm, n_rays)
     origins = np.repeat(points_mm, n_rays, axis=0)
@@ -245,14 +226,7 @@ def section_rays(lumen: Surface, points_mm: Floats, n_rays: int) -> Floats:
 def section_directions(points_mm: Floats, n_rays: int) -> Floats:
     """Return the unit vectors of the rays around axis points.
 
-    Parameters
-    ----------
-    points_mm : (n, 3) axis points in mm.
-    n_rays : number of rays in a section.
-
-    Returns
-    -------
-    directions : (n, n_rays, 3) unit vectors, counter-clockwise about the direction of the axis.
+    Shapes: `points_mm` (n, 3).
     """
     frames = curves.parallel_frames(points_mm)
     angle = 2 * np.pi * np.arange(n_rays) / n_rays

@@ -76,15 +76,7 @@ class _Standing(NamedTuple):
 def find_bulges(lumen: Surface, tubes: Tubes, at_mm: Floats | None = None) -> list[Bulge]:
     """Find the sacs on the lumen's wall.
 
-    Parameters
-    ----------
-    lumen : wall of the vessel.
-    tubes : tubes around all centerlines.
-    at_mm : (3,) point in mm; where given, only the bulge nearest to it is returned, however flat.
-
-    Returns
-    -------
-    bulges : the largest first.
+    Shapes: `at_mm` (3,).
     """
     found = _standing_out(lumen, tubes)
     if at_mm is None:
@@ -96,13 +88,7 @@ def find_bulges(lumen: Surface, tubes: Tubes, at_mm: Floats | None = None) -> li
 
 
 def flat_bulges(lumen: Surface, tubes: Tubes) -> list[Bulge]:
-    """Return bulges that are as wide as sacs but too low, the largest first.
-
-    Parameters
-    ----------
-    lumen : wall of the vessel.
-    tubes : tubes around all centerlines.
-    """
+    """Return bulges that are as wide as sacs but too low, the largest first."""
     found = [one.bulge for one in _standing_out(lumen, tubes) if one.is_wide and not one.is_high]
     return _largest_first([bulge for bulge in found if bulge.height_mm > LOW_MM])
 
@@ -139,16 +125,7 @@ def _about_dome(points_mm: Floats, rise: Floats, reach_mm: float, member: Ints) 
 def bulge_at(lumen: Surface, height_mm: Floats, is_out: Bools, dome_mm: Floats) -> Bulge | None:
     """Return the connected part of the wall that contains a dome.
 
-    Parameters
-    ----------
-    lumen : wall of the vessel.
-    height_mm : (n,) height of its vertices in mm.
-    is_out : (n,) whether a vertex may belong to the bulge.
-    dome_mm : (3,) the dome in mm.
-
-    Returns
-    -------
-    bulge : None where `is_out` does not hold at the dome.
+    Shapes: `height_mm` (n,), `is_out` (n,), `dome_mm` (3,).
     """
     dome = int(np.argmin(np.linalg.norm(lumen.vertices_mm - dome_mm, axis=1)))
     patches = [member for member in _patches(lumen, is_out) if dome in member]

@@ -31,18 +31,7 @@ FEWEST_VOXELS: Final = 4.0
 
 
 def classified(vessel: Vessel, aneurysm: Aneurysm, artery_diameter_mm: float) -> Candidate:
-    """Classify a sac that was cut off.
-
-    Parameters
-    ----------
-    vessel : vessel with its voxel size where it comes from a scan.
-    aneurysm : sac and neck.
-    artery_diameter_mm : diameter of the parent artery at the neck in mm.
-
-    Returns
-    -------
-    candidate : class of the sac, the reasons for it, and a point inside the sac.
-    """
+    """Classify a sac that was cut off."""
     neck_mm, widths_mm, reach_mm = _profile(aneurysm)
     widest_mm = float(widths_mm.max())
     sphere_mm = float(np.cbrt(6 * abs(aneurysm.sac.volume_mm3) / np.pi))

@@ -53,14 +53,7 @@ class Drawn(NamedTuple):
 def cut_along(vessel: Vessel, neck_mm: Floats) -> Drawn:
     """Cut the wall along a neck drawn by hand.
 
-    Parameters
-    ----------
-    vessel : vessel with centerlines.
-    neck_mm : (k, 3) points of a closed curve near the wall, in mm.
-
-    Returns
-    -------
-    drawn : wall of the sac, wall of the artery, and the neck.
+    Shapes: `neck_mm` (k, 3).
 
     Raises
     ------

@@ -111,14 +111,7 @@ class Landing:
 
 
 def close_landing(lumen: Surface, tube: Tube, own: Surface | None = None) -> Landing:
-    """Close the necks and ostia of the lumen's wall along a tube.
-
-    Parameters
-    ----------
-    lumen : wall of the vessel.
-    tube : fitted axis and ovals of the artery.
-    own : the artery's own part of the wall, where a neck is drawn by hand. Where given, all other wall is replaced too.
-    """
+    """Close the necks and ostia of the lumen's wall along a tube."""
     rho = section_rays(lumen, tube.points_mm, N_RAYS)
     radius = np.repeat(tube.radius_mm[:, None], N_RAYS, axis=1)
     # The plate is as stiff against an oval as against other waves around the section, so the oval is subtracted first.

@@ -102,10 +102,7 @@ class Artery(NamedTuple):
     def above_branches_mm(self, points_mm: Floats, normals: Floats | None = None) -> Floats:
         """Return the height (n,) of points above the walls of the branches alone, in mm; negative inside.
 
-        Parameters
-        ----------
-        points_mm : (n, 3) points in mm.
-        normals : (n, 3) unit normals of the lumen's wall at the points; see `height_mm`.
+        Shapes: `points_mm` (n, 3), `normals` (n, 3).
         """
         height, sphere = self.branches.height_mm(points_mm)
         if not len(self.branches.radius_mm):
@@ -206,12 +203,7 @@ class Flank(NamedTuple):
 def believed_from_mm(lumen: Surface, foot_mm: Floats, most_mm: float, blur_mm: float | None) -> float:
     """Return the height in mm above which the flank at a bulge's foot is free of blur.
 
-    Parameters
-    ----------
-    lumen : wall of the vessel.
-    foot_mm : (k, 3) foot of the bulge in mm.
-    most_mm : upper bound of the result in mm.
-    blur_mm : standard deviation of the blur in mm; None where it is unknown.
+    Shapes: `foot_mm` (k, 3).
     """
     near = np.asarray(cKDTree(foot_mm).query(lumen.vertices_mm, distance_upper_bound=most_mm)[0]) < most_mm
     corners = lumen.corners_mm[near[lumen.faces].any(axis=1)]
@@ -228,11 +220,6 @@ def unblurred(flank: Flank, blur_mm: float) -> Flank:
     between them appears with the fraction Phi(d / s) - Phi(-h / s) of its own intensity, where s is the standard
     deviation of the blur and Phi the standard normal distribution. The segmented wall lies where this fraction is one
     half, at d = s Phi^-1(1/2 + Phi(-h / s)). The vertices are moved back by d.
-
-    Parameters
-    ----------
-    flank : wall of the sac as segmented.
-    blur_mm : standard deviation of the blur in mm.
     """
     share = np.minimum(ndtr(-flank.height_mm / blur_mm), DEEPEST)
     normals = Surface(flank.vertices_mm, flank.faces).vertex_normals
@@ -240,19 +227,7 @@ def unblurred(flank: Flank, blur_mm: float) -> Flank:
 
 
 def skirt(flank: Flank, artery: Artery, lumen: Surface, *, n_rings: int) -> Floats:
-    """Continue the flank from its rim down to the artery.
-
-    Parameters
-    ----------
-    flank : wall of the sac above the rim.
-    artery : arteries below the flank.
-    lumen : closed lumen; the continuation stays inside it.
-    n_rings : number of strips of triangles between rim and neck.
-
-    Returns
-    -------
-    rings : (n_rings + 1, k, 3) points in mm, from the k vertices of the rim down to the neck.
-    """
+    """Continue the flank from its rim down to the artery."""
     rim_mm = flank.vertices_mm[flank.rim]
     place = curves.arc_length(np.concatenate([rim_mm, rim_mm[:1]]))
     low_mm = float(np.median(flank.height_mm[flank.rim]))

@@ -50,12 +50,7 @@ def told(vessel: Vessel, path: int, bulges: list[Bulge], aneurysms: tuple[Aneury
 
 
 def necks_told(aneurysms: Sequence[Aneurysm]) -> tuple[str, ...]:
-    """Return notes on necks whose plane is uncertain, or missing.
-
-    Parameters
-    ----------
-    aneurysms : sacs that were cut off.
-    """
+    """Return notes on necks whose plane is uncertain, or missing."""
     notes = []
     for aneurysm in aneurysms:
         if aneurysm.plane is None:
@@ -74,13 +69,7 @@ def necks_told(aneurysms: Sequence[Aneurysm]) -> tuple[str, ...]:
 
 
 def candidates_told(aneurysms: Sequence[Aneurysm], candidates: Sequence[Candidate]) -> tuple[str, ...]:
-    """Return a note on bulges that are not used as aneurysms, with how to choose one.
-
-    Parameters
-    ----------
-    aneurysms : sacs that are used.
-    candidates : all bulges with their class.
-    """
+    """Return a note on bulges that are not used as aneurysms, with how to choose one."""
     others = [one.described for one in candidates if not one.is_aneurysm]
     if not others:
         return ()
@@ -89,12 +78,7 @@ def candidates_told(aneurysms: Sequence[Aneurysm], candidates: Sequence[Candidat
 
 
 def flat_told(bulge: Bulge | None) -> tuple[str, ...]:
-    """Return a note on a bulge that is used as a sac only on request.
-
-    Parameters
-    ----------
-    bulge : flat bulge; None where there is none.
-    """
+    """Return a note on a bulge that is used as a sac only on request."""
     if bulge is None:
         return ()
     return (

@@ -34,11 +34,7 @@ def parent_path(vessel: Vessel, bulges: list[Bulge], outlet_mm: Floats | None) -
     It passes the sac and ends at an outlet, taking the wider branch at every fork. It ends at another inlet only if
     `outlet_mm` is nearest to that.
 
-    Parameters
-    ----------
-    vessel : vessel with centerlines.
-    bulges : bulges of the wall; the first is the sac to pass.
-    outlet_mm : (3,) point in mm near the opening at the end of the parent artery; None to choose by width.
+    Shapes: `outlet_mm` (3,).
     """
     lines = vessel.centerlines
     if outlet_mm is not None:
@@ -53,17 +49,7 @@ def parent_path(vessel: Vessel, bulges: list[Bulge], outlet_mm: Floats | None) -
 
 
 def is_off_sacs(line: Centerline, bulges: list[Bulge]) -> Bools:
-    """Return whether each point of a centerline has an inscribed sphere that no bulge widens.
-
-    Parameters
-    ----------
-    line : centerline of n points.
-    bulges : bulges that may be sacs.
-
-    Returns
-    -------
-    is_off : (n,) whether the sphere reaches into no bulge.
-    """
+    """Return whether each point of a centerline has an inscribed sphere that no bulge widens."""
     off = np.ones(len(line.points_mm), dtype=bool)
     for bulge in bulges:
         off &= bulge.distances_mm(line.points_mm) > IN_SAC * line.inscribed_radius_mm
@@ -71,13 +57,7 @@ def is_off_sacs(line: Centerline, bulges: list[Bulge]) -> Bools:
 
 
 def reach_of(line: Centerline, bulge: Bulge) -> float:
-    """Return the smallest distance from a centerline to a bulge's foot, in parent radii.
-
-    Parameters
-    ----------
-    line : centerline of an artery; its wall is at a distance of 1.
-    bulge : bulge that may be a sac.
-    """
+    """Return the smallest distance from a centerline to a bulge's foot, in parent radii."""
     radius = parent_radius_mm(line.abscissa_mm, line.inscribed_radius_mm)
     return float((cKDTree(bulge.foot_mm).query(line.points_mm)[0] / radius).min())
 

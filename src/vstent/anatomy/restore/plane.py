@@ -73,18 +73,7 @@ class Wall(NamedTuple):
 
 
 def plane_sac(lumen: Surface, tubes: Tubes, bulge: Bulge) -> Aneurysm | None:
-    """Cut a sac off the lumen at its neck plane.
-
-    Parameters
-    ----------
-    lumen : wall of the vessel.
-    tubes : tubes around all centerlines.
-    bulge : part of the wall that may be a sac.
-
-    Returns
-    -------
-    aneurysm : the sac closed by a plane; None where no plane separates it from all arteries.
-    """
+    """Cut a sac off the lumen at its neck plane."""
     height, sphere = tubes.height_mm(lumen.vertices_mm)
     away_mm = bulge.distances_mm(lumen.vertices_mm)
     radius = tubes.radius_mm[sphere]
@@ -214,16 +203,7 @@ class _Frame(NamedTuple):
 def cut_at(wall: Wall, point: Floats, normal: Floats) -> tuple[Surface, Surface]:
     """Cut a sac off its wall by a plane.
 
-    Parameters
-    ----------
-    wall : the wall.
-    point : (3,) point of the plane, in mm.
-    normal : (3,) unit normal, toward the dome.
-
-    Returns
-    -------
-    sac : the part beyond the plane with its pouches, closed by the plane.
-    neck : the largest piece of the section, its normals into the sac: vertices along its rim, and one in its middle.
+    Shapes: `point` (3,), `normal` (3,).
     """
     vertices, faces = wall.sheet.vertices, wall.sheet.faces
     height_mm = (vertices - point) @ normal

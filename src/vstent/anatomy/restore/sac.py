@@ -56,17 +56,6 @@ def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], 
     """Cut the sac of a bulge off the lumen.
 
     Side branches that arise from the sac or beside it are cut off along their own tubes.
-
-    Parameters
-    ----------
-    vessel : vessel with centerlines.
-    landing : landing surface of the parent artery.
-    side_lines : centerlines other than that of the parent artery.
-    bulge : part of the wall that may be a sac.
-
-    Returns
-    -------
-    aneurysm : sac and neck; None where the bulge is not on the parent artery, or is too flat or too uneven for a sac.
     """
     lumen = vessel.lumen
     artery = _artery(vessel, landing, side_lines, bulge)
@@ -101,14 +90,7 @@ def is_sac(aneurysm: Aneurysm) -> bool:
 
 
 def is_beside_branch(landing: Landing, side_lines: Sequence[Centerline], bulge: Bulge) -> bool:
-    """Return whether a branch leaves the parent artery under a bulge or beside it.
-
-    Parameters
-    ----------
-    landing : landing surface of the parent artery.
-    side_lines : centerlines other than that of the parent artery.
-    bulge : part of the wall that may be a sac.
-    """
+    """Return whether a branch leaves the parent artery under a bulge or beside it."""
     foot = cKDTree(bulge.foot_mm)
     for line in side_lines:
         is_apart = landing.solid.signed_distance(line.points_mm) > -0.5 * line.inscribed_radius_mm
@@ -133,24 +115,13 @@ def _low_mm(vessel: Vessel, landing: Landing, bulge: Bulge) -> float:
 def is_in_one(points_mm: Floats, aneurysms: Sequence[Aneurysm]) -> bool:
     """Return whether most points of a sac or bulge lie in or on one of the aneurysms.
 
-    Parameters
-    ----------
-    points_mm : (n, 3) points in mm.
-    aneurysms : sacs that are already cut off.
+    Shapes: `points_mm` (n, 3).
     """
     return any(np.median(one.sac.signed_distance(points_mm)) < ON_SAC_MM for one in aneurysms)
 
 
 def drawn_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], drawn: Drawn) -> Aneurysm:
-    """Cut off the sac at a neck drawn by hand; side branches that arise from it are cut off along their tubes.
-
-    Parameters
-    ----------
-    vessel : vessel with centerlines.
-    landing : landing surface of the parent artery.
-    side_lines : centerlines other than that of the parent artery.
-    drawn : wall cut along the drawn neck.
-    """
+    """Cut off the sac at a neck drawn by hand; side branches that arise from it are cut off along their tubes."""
     artery = _artery(vessel, landing, side_lines, drawn.bulge)
     normals = Surface(drawn.vertices_mm, drawn.faces).vertex_normals
     in_branch_mm = _low_mm(vessel, landing, drawn.bulge) - artery.above_branches_mm(drawn.vertices_mm, normals)

@@ -113,12 +113,9 @@ def drift(mesh: Any, flux: Any, result: Any) -> None:
 
     Parameters
     ----------
-    mesh : Mesh
-        Connections of the cells.
-    flux : (f,)
-        Flow rate to the upper side of every face, mm3/s.
-    result : (n, 3)
-        Set to the displacements.
+    mesh : connections of the cells.
+    flux : (f,); flow rate to the upper side of every face, mm3/s.
+    result : (n, 3); set to the displacements.
     """
     first, face, side, per_volume = mesh.first, mesh.face, mesh.side, mesh.per_volume
     for i in prange(len(per_volume)):
@@ -254,22 +251,14 @@ def march(mesh: Any, groups: Any, held: Any, flux: Any, moves: Any, base: float,
 
     Parameters
     ----------
-    mesh : Mesh
-        Connections of the cells.
-    groups : Groups
-        Groups of cells.
-    held : Held
-        Concentration and masses; changed in place.
-    flux : (f,)
-        Flow rate to the upper side of every face, mm3/s; it balances in every cell.
-    moves : (n, 3)
-        Displacement of the blood, in cells per s (see `drift`).
-    base : float
-        Base step, s.
-    upper : float
-        Largest concentration of the inflow and of the cells.
-    empty : float
-        Largest concentration in a group that is skipped.
+    mesh : connections of the cells.
+    groups : groups of cells.
+    held : concentration and masses; changed in place.
+    flux : (f,); flow rate to the upper side of every face, mm3/s; it balances in every cell.
+    moves : (n, 3); displacement of the blood, in cells per s (see `drift`).
+    base : base step, s.
+    upper : largest concentration of the inflow and of the cells.
+    empty : largest concentration in a group that is skipped.
     """
     top = len(groups.end) - 1
     held.state[:, TIME] = ZERO

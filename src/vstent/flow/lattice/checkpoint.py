@@ -62,14 +62,9 @@ def unpack(case: FlowCase, cell_size_mm: float, saved: Saved, close_up: CloseUp 
 
     Parameters
     ----------
-    case : FlowCase
-        The flow case.
-    cell_size_mm : float
-        Grid spacing.
-    saved : dict of arrays
-        Result of `pack`.
-    close_up : CloseUp or None
-        Refined region and the flow around it.
+    cell_size_mm : grid spacing.
+    saved : dict of arrays; result of `pack`.
+    close_up : refined region and the flow around it.
     """
     check_s, kept = float(saved["check_s"]), int(saved["kept"])
     state = build(case, cell_size_mm, check_s, saved["pace"], close_up=close_up, start=None, kept=kept)

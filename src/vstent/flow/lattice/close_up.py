@@ -108,10 +108,8 @@ class CloseUp:
 
         Parameters
         ----------
-        points_mm : (m, 3)
-            Points.
-        surface : Surface
-            Wall of the vessel, with the extensions of its openings.
+        points_mm : (m, 3); points.
+        surface : wall of the vessel, with the extensions of its openings.
         """
         outer = self.outer.finest
         cells, weights = lattice_sampling.stencils(outer.index, outer.places(points_mm))
@@ -147,10 +145,7 @@ def close_up(case: FlowCase, outer: FlowField) -> CloseUp:
 
     Parameters
     ----------
-    case : FlowCase
-        The flow case.
-    outer : FlowField
-        Flow in the whole vessel on the coarser grid.
+    outer : flow in the whole vessel on the coarser grid.
 
     Raises
     ------
@@ -217,12 +212,7 @@ def build(case: FlowCase, cell_size_mm: float, chosen: CloseUp) -> Domain:
 
     Parameters
     ----------
-    case : FlowCase
-        The flow case.
-    cell_size_mm : float
-        Fine grid spacing.
-    chosen : CloseUp
-        The refined region.
+    cell_size_mm : fine grid spacing.
     """
     grid = domains.build(case.vessel, cell_size_mm, _window(chosen, cell_size_mm))
     leads_beyond = grid.link_patch == BEYOND
@@ -251,15 +241,7 @@ def _window(chosen: CloseUp, cell_size_mm: float) -> Window:
 
 
 def assembled(chosen: CloseUp, inner: FlowField) -> FlowField:
-    """Return one field of both grids: the whole vessel on the coarser one, and the refined region.
-
-    Parameters
-    ----------
-    chosen : CloseUp
-        The refined region and the flow around it.
-    inner : FlowField
-        Flow in the region.
-    """
+    """Return one field of both grids: the whole vessel on the coarser one, and the refined region."""
     outer, grid = chosen.outer, chosen.outer.finest
     behind_mm = inner.wall.vertices_mm - 0.5 * grid.cell_size_mm * inner.wall.vertex_normals
     # Vertices with fine cells all around.

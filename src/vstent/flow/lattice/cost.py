@@ -87,15 +87,6 @@ def estimate(case: FlowCase) -> Cost:
 def refuse_too_large(case: FlowCase, free_bytes: float | None = None, gpu_bytes: float | None = None) -> None:
     """Check that a flow fits in the free memory, in the GPU's memory if it runs there, and in 32-bit addresses.
 
-    Parameters
-    ----------
-    case : FlowCase
-        The flow case.
-    free_bytes : float or None
-        Free memory; None: measure it.
-    gpu_bytes : float or None
-        Free memory of the GPU; None: measure it.
-
     Raises
     ------
     FlowError

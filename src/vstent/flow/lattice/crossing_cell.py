@@ -69,16 +69,6 @@ def crossing_wires(across: int, along: int, height: int, diameter: float, apart:
     """Return two families of wires along the diagonals of a box.
 
     Their angle to the first axis is atan(across / along). Their spacing is along * across / hypot(along, across).
-
-    Parameters
-    ----------
-    across, along, height : int
-        Size of the box in cells: along x across x height.
-    diameter : float
-        Wire diameter in cells.
-    apart : float
-        Distance between the planes of the two families in diameters: 1, one on the other; 0, both in one plane. Woven
-        wires occur in both arrangements.
     """
     length = float(np.hypot(along, across))
     up, down = (along / length, across / length, 0.0), (along / length, -across / length, 0.0)
@@ -95,12 +85,7 @@ def row_of_wires(spacing: int, height: int, diameter: float) -> Wires:
 def flow_through(wires: Wires, force: Floats) -> CellFlow:
     """Compute the steady flow, with inertia, under a body force.
 
-    Parameters
-    ----------
-    wires : Wires
-        Wires and box.
-    force : (3,)
-        Body force per cell volume, in lattice units.
+    Shapes: `force` (3,).
 
     Raises
     ------
@@ -129,12 +114,7 @@ def sheet_speed(flow: CellFlow, force: Floats) -> float:
     - 1)). The mean of u yields the speed u_0 at the sheet. It is negative where the wires have more drag than a sheet
     could have.
 
-    Parameters
-    ----------
-    flow : CellFlow
-        Steady flow through the wires.
-    force : (3,)
-        Body force that drives it.
+    Shapes: `force` (3,).
     """
     height = flow.velocity.shape[2]
     mean, _, through = flow.superficial_velocity

@@ -47,23 +47,7 @@ class Ends:
     def imposed(self, patches: Ints, links: Sequence[Ints]) -> tuple[Floats, Floats, Floats, Floats]:
         """Return the boundary conditions at the ends of the grid.
 
-        Parameters
-        ----------
-        patches : (k,) int
-            Patch number of every end.
-        links : sequence of k arrays
-            Links of every end.
-
-        Returns
-        -------
-        openings : (k, d3q19.OPENING)
-            Rows for `d3q19.drive`.
-        wanted : (k,)
-            Speed to impose at mean flow, in lattice units.
-        course : (m, k)
-            Speed or density to add to it at m moments of the cycle of the surrounding flow.
-        shape : (m, l, 2)
-            Profile coefficients of all links at these moments (see `d3q19.drive`).
+        Shapes: `patches` (k,).
         """
         usual, shape = self._at(self.close_up, patches, links)
         wanted = usual[:, d3q19.WANTED].copy()
@@ -202,16 +186,7 @@ def _sent(direction: Ints, normal: Floats, area: float, inner: Floats, at: Float
     missing. It is added to the links near the rim. Scaling the whole profile instead would make the velocity on the
     axis too high, and this error persists for tens of diameters downstream.
 
-    Parameters
-    ----------
-    direction : (l,) int
-        Lattice direction of each link.
-    normal : (3,)
-        Outward normal.
-    area : float
-        Area of the opening in cell faces.
-    inner, at, outer : (l, 3)
-        Velocity at the start, the middle and the end of each link, divided by the mean speed.
+    Shapes: `direction` (l,), `normal` (3,), `inner, at, outer` (l, 3).
     """
     c, weight = directions.VELOCITIES[direction], d3q19.WEIGHTS[direction]
     sent = -6 * weight * (c * at).sum(axis=1)

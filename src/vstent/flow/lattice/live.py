@@ -153,8 +153,7 @@ def known(values: Floats) -> tuple[float, float]:
 
     Parameters
     ----------
-    values : (n,) float
-        Values at equal intervals of time.
+    values : (n,); values at equal intervals of time.
     """
     recent = [average(values[:n]) for n in range(len(values), max(len(values) - RECENT, 0), -1)]
     mean = recent[0][0]
@@ -172,8 +171,7 @@ def average(values: Floats) -> tuple[float, float]:
 
     Parameters
     ----------
-    values : (n,) float
-        Values at equal intervals of time.
+    values : (n,); values at equal intervals of time.
     """
     late = float(values[-LATEST:].mean())
     # A change passes through zero where a value turns: the worst estimate of the last third counts.

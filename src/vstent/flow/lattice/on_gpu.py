@@ -265,16 +265,7 @@ def _arrays(arguments: Sequence[Any]) -> Iterator[Any]:
 def seconds_of_update(place: Ints, length: Ints, stride: int, relaxation: Sequence[Any]) -> float:
     """Return the run time of an update of cells without walls, the best of several.
 
-    Parameters
-    ----------
-    place : (s,) int
-        Storage place of the first cell of every segment.
-    length : (s,) int
-        Number of cells of every segment.
-    stride : int
-        Distance between two populations of a cell.
-    relaxation
-        As in `d3q19.update`.
+    Shapes: `place` (s,), `length` (s,).
     """
     time, law, limit, odd_rate = relaxation
     rows, none = np.zeros((len(length), 9), np.int32), np.zeros(0, np.int32)

@@ -39,15 +39,6 @@ def peak_speed_m_s(case: FlowCase, start: FlowField | None, close_up: CloseUp | 
     """Estimate the speed that sets the time step: all but a fraction `FEW` of the blood stays below it.
 
     The overall peak speed is at most `HASTE` times as high.
-
-    Parameters
-    ----------
-    case : FlowCase
-        The flow case.
-    start : FlowField or None
-        A flow on a coarser grid, at the mean or at one moment; None: estimate from the openings' flow rates.
-    close_up : CloseUp or None
-        Refined region: only the blood within it counts.
     """
     if start is not None:
         speed_m_s = start.speed_m_s if close_up is None else start.finest.speed_m_s[close_up.part < 0]
@@ -67,17 +58,6 @@ def pace(case: FlowCase, cell_size_mm: float, start: FlowField | None, close_up:
     The fastest blood of each phase moves at most `lattice_speed` cells per step. A longer time step also lowers the
     lattice's speed of sound, so that more flow is stored by compressibility. Where a step is longer than the shortest,
     it is limited so that this part stays below `STORED`.
-
-    Parameters
-    ----------
-    case : FlowCase
-        The flow case.
-    cell_size_mm : float
-        Grid spacing.
-    start : FlowField or None
-        A flow on a coarser grid, if possible with its phases.
-    close_up : CloseUp or None
-        Refined region.
 
     Raises
     ------

@@ -78,23 +78,7 @@ def _mean(snapshots: Sequence[Snapshot], values: Iterable[Floats | NDArray[np.fl
 def field_of(
     state: State, flow: Reading, outcome: Outcome, left: float, advice: str, phases: tuple[Phase, ...] = ()
 ) -> FlowField:
-    """Return the flow field of a run.
-
-    Parameters
-    ----------
-    state : State
-        The run.
-    flow : Reading
-        The flow in SI units.
-    outcome : Outcome
-        Convergence history and run time.
-    left : float
-        Expected remaining change, or uncertainty of the time averages, as a fraction.
-    advice : str
-        Sentence on convergence; sentences on the grid are appended.
-    phases : tuple of Phase
-        Phases of a pulsatile flow.
-    """
+    """Return the flow field of a run."""
     domain, vessel = state.domain, state.case.vessel
     section_Pa = domains.section_pressure_Pa(vessel, domain, flow.pressure_Pa)
     inlet_Pa, outlet_Pa = vessel.of_inlets_and_outlets(section_Pa)

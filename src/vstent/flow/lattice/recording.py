@@ -56,10 +56,8 @@ def recorded(launches: Callable[[], None], stream: Any) -> Callable[[], None]:
 
     Parameters
     ----------
-    launches : callable
-        Launches kernels on `stream` and nothing else. All must have been loaded before.
-    stream : numba.cuda stream
-        The stream. The replay is queued there.
+    launches : launches kernels on `stream` and nothing else. All must have been loaded before.
+    stream : numba.cuda stream; the stream. The replay is queued there.
 
     Raises
     ------

@@ -77,19 +77,7 @@ class GridResistance:
 
 
 def build_screen(case: FlowCase, domain: Domain, addressing: Addressing, scales: Scales) -> ScreenEntries:
-    """Return the screen of a case in lattice units.
-
-    Parameters
-    ----------
-    case : FlowCase
-        The flow case; without media the result is empty.
-    domain : Domain
-        The grid.
-    addressing : Addressing
-        Segments of cells.
-    scales : Scales
-        Lattice units.
-    """
+    """Return the screen of a case in lattice units."""
     segments = len(addressing.length)
     if not case.media:
         return ScreenEntries(*d3q19.no_screen(segments), np.zeros(0, np.int32))
@@ -113,16 +101,7 @@ def build_screen(case: FlowCase, domain: Domain, addressing: Addressing, scales:
 def on_grid(media: Sequence[Sheet], index: Ints, origin_mm: Floats, cell_size_mm: float) -> GridResistance:
     """Distribute the resistance of media over grid cells.
 
-    Parameters
-    ----------
-    media : sequence of Sheet
-        At least one; each is distributed alone, and then those that share a cell are combined (see this module).
-    index : (i, j, k) int
-        Cell number at every grid point, -1 outside.
-    origin_mm : (3,)
-        Position of grid point 0, 0, 0.
-    cell_size_mm : float
-        Grid spacing.
+    Shapes: `index` (i, j, k), `origin_mm` (3,).
     """
     alone = [_of_sheet(one, index, origin_mm, cell_size_mm) for one in media]
     return alone[0] if len(alone) == 1 else _combined(alone)

@@ -49,18 +49,7 @@ class Mean:
 def left_to_settle(history: Floats, velocity: Sequence[NDArray[np.float32]]) -> float:
     """Return the estimated distance of a steady run from convergence.
 
-    Parameters
-    ----------
-    history : (checks, quantities) float
-        Monitored quantities at every check.
-    velocity : sequence of (n, 3) float32
-        Velocity fields at the last checks, oldest first.
-
-    Returns
-    -------
-    float
-        Expected remaining change as a fraction: the larger of that of the monitored quantities and `SHARE_OF_FIELD`
-        times that of the field. nan when the history is not finite, inf with too few checks.
+    Shapes: `history` (checks, quantities), `velocity` (n, 3).
     """
     return max(quantities_left(history), SHARE_OF_FIELD * field_left(velocity))
 
@@ -72,15 +61,7 @@ def field_left(velocity: Sequence[NDArray[np.float32]]) -> float:
     stent the mean speed in the sac drops quickly and then rises for half a second while the vortex moves to its final
     position. At the turning point the mean seems converged although it will still change by 5 %.
 
-    Parameters
-    ----------
-    velocity : sequence of (n, 3) float32
-        Velocity fields at the last checks, oldest first.
-
-    Returns
-    -------
-    float
-        Fraction of the field; inf with fewer than 2 `CHECKS_APART` + 1 fields.
+    Shapes: `velocity` (n, 3).
     """
     if len(velocity) < 2 * CHECKS_APART + 1:
         return float("inf")
@@ -94,13 +75,6 @@ def with_check(blocks: Sequence[Snapshot], now: Snapshot) -> tuple[Snapshot, ...
 
     All blocks hold the same number of checks except the last, which is still being filled. When `BLOCKS` blocks are
     full, each pair is merged into one.
-
-    Parameters
-    ----------
-    blocks : sequence of Snapshot
-        Means over blocks of checks, oldest first.
-    now : Snapshot
-        Flow at the new check.
     """
     if blocks and blocks[-1].checks < blocks[0].checks:
         return *blocks[:-1], blocks[-1].and_also(now)
@@ -116,14 +90,7 @@ def mean_of(blocks: Sequence[Snapshot], history: Floats, sac: Ints) -> Mean:
     remainder is smallest. Where the error exceeds `NO_MEAN`, the last `LATEST` checks are averaged instead (rounded up
     to whole blocks), so that little of the initial transient enters.
 
-    Parameters
-    ----------
-    blocks : sequence of Snapshot
-        Means over blocks of checks, oldest first.
-    history : (checks, quantities) float
-        Monitored quantities at every check.
-    sac : (n,) int
-        Cells of the sac, where the error of the local velocity is estimated.
+    Shapes: `history` (checks, quantities), `sac` (n,).
 
     References
     ----------

@@ -216,10 +216,8 @@ def address(domain: Domain, limit: NDArray[np.float32]) -> Addressing:
 
     Parameters
     ----------
-    domain : Domain
-        The grid.
-    limit : (n,) float32
-        Largest grid Reynolds number of every cell (see `thickest`). A segment contains only cells with equal values.
+    limit : (n,) float32; largest grid Reynolds number of every cell (see `thickest`). A segment contains only cells
+        with equal values.
     """
     cells = domain.cells
     inside = np.zeros(cells.max(axis=0) + 3, dtype=bool)
@@ -293,19 +291,7 @@ def _septa(domain: Domain, number: Ints, stride: int) -> Ints:
 
 
 def build_links(case: FlowCase, grid: Grid, scales: Scales, close_up: CloseUp | None) -> Links:
-    """Return the links of the wall (interpolated bounce-back) and of the ends (imposed flow or pressure).
-
-    Parameters
-    ----------
-    case : FlowCase
-        The flow case.
-    grid : Grid
-        The grid.
-    scales : Scales
-        Lattice units.
-    close_up : CloseUp or None
-        Refined region and the flow around it; None: the grid covers the whole vessel.
-    """
+    """Return the links of the wall (interpolated bounce-back) and of the ends (imposed flow or pressure)."""
     domain, addressing, order = grid.domain, grid.addressing, grid.link_order
     patch = domain.link_patch[order]
     patches = np.unique(patch[patch > 0])

@@ -122,10 +122,8 @@ class OnDevice(Protocol):
 
         Parameters
         ----------
-        wanted, moments : (pairs, k), (pairs, 3)
-            Boundary values from `stepping.imposed`.
-        first_pair : int
-            Number of the first pair, counted from the last check.
+        wanted, moments : (pairs, k), (pairs, 3); boundary values from `stepping.imposed`.
+        first_pair : number of the first pair, counted from the last check.
         """
 
     def begin(self, wanted: Floats, moments: Floats, first_pair: int) -> bool:
@@ -141,15 +139,7 @@ class OnDevice(Protocol):
         """Return the relaxation times (e,) of shear-thinning blood in the cells of the screen."""
 
     def rescale(self, state: "State", stretch: float, stress: float) -> None:
-        """Take links and screen of `state`, and convert populations to its time step.
-
-        Parameters
-        ----------
-        state : State
-            The run, with links and screen of the new time step.
-        stretch, stress
-            As in `d3q19.rescale`.
-        """
+        """Take links and screen of `state`, and convert populations to its time step."""
 
     @property
     def how(self) -> str:

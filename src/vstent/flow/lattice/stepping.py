@@ -49,20 +49,12 @@ def build(
 
     Parameters
     ----------
-    case : FlowCase
-        The flow case.
-    cell_size_mm : float
-        Grid spacing.
-    check_s : float
-        Time between checks.
-    pace : (m,) int
-        Number of time steps from each check to the next; even; repeated cyclically.
-    close_up : CloseUp or None
-        Refined region and the flow around it; None: the grid covers the whole vessel.
-    start : FlowField or None
-        Initial flow, on any grid; None: at rest.
-    kept : int
-        Number of last checks that are kept.
+    cell_size_mm : grid spacing.
+    check_s : time between checks.
+    pace : (m,); number of time steps from each check to the next; even; repeated cyclically.
+    close_up : refined region and the flow around it; None: the grid covers the whole vessel.
+    start : initial flow, on any grid; None: at rest.
+    kept : number of last checks that are kept.
     """
     if case.numerics.device_gpu:
         require_gpu()
@@ -100,10 +92,7 @@ def prepare(case: FlowCase, cell_size_mm: float) -> None:
 
     Parameters
     ----------
-    case : FlowCase
-        The flow case.
-    cell_size_mm : float
-        Grid spacing.
+    cell_size_mm : grid spacing.
     """
     grid = _grid(case, cell_size_mm, None)
     _ = grid.bands, grid.groups, grid.domain.index, grid.domain.depth_mm
@@ -265,19 +254,7 @@ def _pairs(state: State, steps: int) -> tuple[Floats, Floats, int]:
 def imposed(state: State, steps: Floats | Ints) -> tuple[Floats, Floats]:
     """Return the boundary values at time steps (t,) since the last check.
 
-    Parameters
-    ----------
-    state : State
-        The run.
-    steps : (t,)
-        Time steps, counted from the last check.
-
-    Returns
-    -------
-    wanted : (t, k)
-        Speed or density imposed at every end.
-    moments : (t, 3)
-        The two moments of the cycle between which each step lies, and the fraction of the way (see `d3q19.drive`).
+    Shapes: `steps` (t,).
     """
     links = state.links
     count = len(links.course)

@@ -18,12 +18,7 @@ def linear_weights(fraction: Floats, has_one: NDArray[np.bool_]) -> Floats:
     A link whose wall is nearer than half-way needs the cell behind. Where that is not blood, half-way bounce-back is
     used.
 
-    Parameters
-    ----------
-    fraction : (l,)
-        Position of the wall along each link, 0 to 1.
-    has_one : (l,) bool
-        Whether the cell behind the link's cell is blood.
+    Shapes: `fraction` (l,), `has_one` (l,).
 
     References
     ----------
@@ -40,10 +35,7 @@ def linear_weights(fraction: Floats, has_one: NDArray[np.bool_]) -> Floats:
 def quadratic_weights(fraction: Floats) -> Floats:
     """Return the weights (l, 5) of quadratically interpolated bounce-back for a, b, c, e and g (see `d3q19.defer`).
 
-    Parameters
-    ----------
-    fraction : (l,)
-        Position of the wall along each link, 0 to 1.
+    Shapes: `fraction` (l,).
 
     References
     ----------
@@ -64,19 +56,7 @@ def parabolic_weights(fraction: Floats, relaxation_steps: float) -> tuple[Floats
     a compromise between a plane channel and a tube; determining it from the populations would be wrong where the force
     of a screen meets the wall.
 
-    Parameters
-    ----------
-    fraction : (l,)
-        Position of the wall along each link, 0 to 1.
-    relaxation_steps : float
-        Relaxation time of the stress, in time steps.
-
-    Returns
-    -------
-    weights : (l, 5)
-        For the populations a, b, c, e and g (see `d3q19.defer`).
-    viscous : (l,)
-        Multiple of `CURVE` that the weights would contain in addition without viscosity.
+    Shapes: `fraction` (l,).
 
     References
     ----------

@@ -43,12 +43,8 @@ def conditions(case: FlowCase, setup: FoamSetup, sections: Sequence[Floats]) -> 
 
     Parameters
     ----------
-    case : FlowCase
-        The flow.
-    setup : FoamSetup
-        Setup of the OpenFOAM case.
-    sections : sequence of (k, 3) float
-        Polygon of every opening in mm.
+    setup : setup of the OpenFOAM case.
+    sections : sequence of (k, 3); polygon of every opening in mm.
     """
     ends = zip(case.vessel.openings, case.ends, sections, strict=True)
     return {opening.role: _condition(case, setup, opening, end, section) for opening, end, section in ends}

@@ -69,15 +69,6 @@ class Snapshot:
 def bridge(case: FlowCase, domain: Domain, folder: Path) -> Bridge:
     """Build the interpolation matrices of a meshed case.
 
-    Parameters
-    ----------
-    case : FlowCase
-        The flow.
-    domain : Domain
-        The grid of the result.
-    folder : Path
-        The case folder.
-
     Raises
     ------
     ReadError

@@ -75,10 +75,8 @@ def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
 
     Parameters
     ----------
-    case : FlowCase
-        The flow. Media are ignored, because OpenFOAM meshes struts instead.
-    setup : FoamSetup
-        Mesh, parallel processes, OpenFOAM flavour and struts.
+    case : the flow. Media are ignored, because OpenFOAM meshes struts instead.
+    setup : mesh, parallel processes, OpenFOAM flavour and struts.
 
     Raises
     ------

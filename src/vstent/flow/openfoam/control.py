@@ -66,16 +66,10 @@ def control(case: FlowCase, setup: FoamSetup, step_s: float, *, walls: Sequence[
 
     Parameters
     ----------
-    case : FlowCase
-        The flow.
-    setup : FoamSetup
-        Setup of the OpenFOAM case.
-    step_s : float
-        First time step of a transient flow.
-    walls : sequence of str
-        Names of the wall patches.
-    has_neck : bool
-        Whether to sample the flow through the neck.
+    setup : setup of the OpenFOAM case.
+    step_s : first time step of a transient flow.
+    walls : names of the wall patches.
+    has_neck : whether to sample the flow through the neck.
     """
     is_org, is_steady = setup.flavour == "org", case.waveform is None
     program = "foamRun" if is_org else "simpleFoam" if is_steady else "pimpleFoam"
@@ -155,10 +149,8 @@ def decomposition(setup: FoamSetup, extent_mm: Floats) -> str:
 
     Parameters
     ----------
-    setup : FoamSetup
-        Setup with the number of processes.
-    extent_mm : (3,) float
-        Size of the domain along the axes.
+    setup : setup with the number of processes.
+    extent_mm : (3,); size of the domain along the axes.
     """
     parts = np.ones(3, dtype=int)
     for factor in _prime_factors(setup.processes):

@@ -16,20 +16,7 @@ _COMMENT: Final = re.compile(r"/\*.*?\*/|//[^\n]*", re.DOTALL)
 
 
 def foam_file(name: str, entries: Entries | str, *, kind: str = "dictionary", note: str = "") -> str:
-    """Return the text of an OpenFOAM file.
-
-    Parameters
-    ----------
-    name : str
-        Object name in the header.
-    entries : mapping or str
-        Contents. Nested mappings become sub-dictionaries, sequences lists, booleans ``yes`` and ``no``; a string is
-        written unchanged.
-    kind : str
-        Class in the header.
-    note : str
-        Comment below the header.
-    """
+    """Return the text of an OpenFOAM file."""
     header = _entry("FoamFile", {"version": "2.0", "format": "ascii", "class": kind, "object": name}, "")
     body = entries if isinstance(entries, str) else "".join(_entry(key, value, "") for key, value in entries.items())
     comment = f"// {note}\n\n" if note else ""

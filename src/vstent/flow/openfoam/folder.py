@@ -54,12 +54,7 @@ def mesh(found: program.Program, folder: Path, setup: FoamSetup) -> None:
 
     Parameters
     ----------
-    found : Program
-        The OpenFOAM installation.
-    folder : Path
-        The case folder.
-    setup : FoamSetup
-        Setup of the OpenFOAM case.
+    setup : setup of the OpenFOAM case.
 
     Raises
     ------

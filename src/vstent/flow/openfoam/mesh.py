@@ -73,18 +73,7 @@ def snappy(
 ) -> str:
     """Return snappyHexMeshDict.
 
-    Parameters
-    ----------
-    setup : FoamSetup
-        Grid spacing, layers and struts.
-    patches : dict of str
-        ``wall`` or ``patch`` for the name of every patch.
-    ends : dict of End
-        Position of every opening's patch, by name; cells are refined at those too narrow for the grid spacing.
-    inside_mm : (3,) float
-        A point in the blood.
-    has_neck : bool
-        Whether there is a neck to refine at.
+    Shapes: `inside_mm` (3,).
     """
     walls = [name for name, kind in patches.items() if kind == "wall"]
     narrow = {name: end for name, end in ends.items() if end.levels(setup.cell_size_mm)}

@@ -45,10 +45,8 @@ def named_patches(case: FlowCase) -> tuple[tuple[Patch, ...], tuple[Floats, ...]
 
     Returns
     -------
-    patches : tuple of Patch
-        Patches of one closed surface; every face is in exactly one.
-    sections : tuple of (k, 3) float
-        For every opening the polygon of its end, in mm.
+    patches : patches of one closed surface; every face is in exactly one.
+    sections : tuple of (k, 3); for every opening the polygon of its end, in mm.
 
     Raises
     ------
@@ -70,10 +68,8 @@ def stl_text(solids: dict[str, Floats], scale: float) -> str:
 
     Parameters
     ----------
-    solids : dict of (f, 3, 3) float
-        Corners of each solid's faces, by name.
-    scale : float
-        Factor on all lengths.
+    solids : dict of (f, 3, 3); corners of each solid's faces, by name.
+    scale : factor on all lengths.
     """
     return "".join(_solid(name, corners * scale) for name, corners in solids.items())
 

@@ -128,10 +128,8 @@ def cause(said: str, code: int) -> str:
 
     Parameters
     ----------
-    said : str
-        Output of the program.
-    code : int
-        Exit status.
+    said : output of the program.
+    code : exit status.
     """
     if code == -9 or "Killed" in said or "bad_alloc" in said:
         return "the memory was not sufficient; use a coarser grid spacing or fewer processes"

@@ -37,15 +37,6 @@ class VolumeField:
 def read_field(folder: Path, time: str, name: str) -> VolumeField:
     """Read an ASCII field of a case, joined over the folders of its processes if it is decomposed.
 
-    Parameters
-    ----------
-    folder : Path
-        The case folder.
-    time : str
-        Name of the time.
-    name : str
-        Name of the field.
-
     Raises
     ------
     ReadError

@@ -24,10 +24,8 @@ def fits(sources: Floats, targets: Floats) -> csr_matrix:
 
     Parameters
     ----------
-    sources : (s, 3) float
-        Points with known values.
-    targets : (t, 3) float
-        Points at which values are wanted.
+    sources : (s, 3); points with known values.
+    targets : (t, 3); points at which values are wanted.
     """
     count = min(NEIGHBOURS, len(sources))
     tree = cKDTree(sources)
@@ -59,14 +57,7 @@ def _fit(offset: Floats, distance: Floats) -> Floats:
 def near_means(sources: Floats, targets: Floats, reach: float) -> csr_matrix:
     """Return the matrix (t, s) of inverse-distance weighted means over the four nearest sources.
 
-    Parameters
-    ----------
-    sources : (s, d) float
-        Points with known values, of any dimension.
-    targets : (t, d) float
-        Points at which values are wanted.
-    reach : float
-        Length scale: a tenth of it is added to the distances, squared, to limit the weights.
+    Shapes: `sources` (s, d), `targets` (t, d).
     """
     count = min(4, len(sources))
     distance, near = cKDTree(sources).query(targets, k=count)

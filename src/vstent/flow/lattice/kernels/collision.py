@@ -93,19 +93,7 @@ def _third(u: Any, n: Any, part: Any) -> tuple[Any, ...]:
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def _even(density: Any, u: Any, flux: Any, trace: Any) -> tuple[Any, ...]:
-    """Return the even parts (10) after collision: the rest population and half the sum of each of the nine pairs.
-
-    Parameters
-    ----------
-    density
-        Density deviation.
-    u
-        Velocity (3).
-    flux
-        Second moments after collision (6).
-    trace
-        Sum of the first three of them.
-    """
+    """Return the even parts (10) after collision: the rest population and half the sum of each of the nine pairs."""
     xx, yy, zz, xy, xz, yz = _times(_EIGHTH, flux)
     wx, wy, wz = u[0] * u[0], u[1] * u[1], u[2] * u[2]
     squared = wx + wy + wz
@@ -131,15 +119,7 @@ def _even(density: Any, u: Any, flux: Any, trace: Any) -> tuple[Any, ...]:
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def _odd(momentum: Any, third: Any) -> tuple[Any, ...]:
-    """Return what is added to half the difference of each of the nine pairs (see `relaxed_pair`).
-
-    Parameters
-    ----------
-    momentum
-        Momentum added (3).
-    third
-        Third moments, divided by four (6).
-    """
+    """Return what is added to half the difference of each of the nine pairs (see `relaxed_pair`)."""
     x, y, z = _TWELFTH * momentum[0], _TWELFTH * momentum[1], _TWELFTH * momentum[2]
     xyy, xzz, xxy, yzz, xxz, yyz = third
     xy, xz, yx, yz, zx, zy = x + xyy, x + xzz, y + xxy, y + yzz, z + xxz, z + yyz
@@ -158,17 +138,7 @@ def _odd(momentum: Any, third: Any) -> tuple[Any, ...]:
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def relaxed_pair(a: Any, b: Any, even: Any, odd: Any, half_kept: Any) -> tuple[Any, Any]:
-    """Return the collided populations of a pair, already swapped: the first belongs in the place of `a`.
-
-    Parameters
-    ----------
-    a, b
-        Populations of two opposite directions.
-    even, odd
-        Parts of this pair from `collided`.
-    half_kept
-        Third result of `collided`.
-    """
+    """Return the collided populations of a pair, already swapped: the first belongs in the place of `a`."""
     new = odd + half_kept * (a - b)
     return even - new, even + new
 
@@ -231,15 +201,6 @@ def thinned(size: Any, time: Any, law: Any) -> Any:
     The strain rate is 1.5 / time times the departure of the second moments from equilibrium. It depends on the
     relaxation time itself, which is found by three fixed-point iterations from the viscosity at rest. Numbers must be
     scalars, not Lanes.
-
-    Parameters
-    ----------
-    size
-        Result of `stress_size`.
-    time
-        Relaxation time at high shear rate.
-    law
-        Carreau-Yasuda law (4), as in `d3q19.update`.
 
     References
     ----------
@@ -322,15 +283,11 @@ def resist(normal: Any, entry: Any, u: Any, blood: Any) -> tuple[Any, Any]:
 
     Parameters
     ----------
-    normal
-        Unit normal of the screen (3).
-    entry
-        Linear resistance along the normal, linear resistance across it, quadratic resistance along it, all per cell and
-        time step, and the `spread` of `of_thin_sheet`.
-    u
-        Velocity without the screen (3).
-    blood
-        Result of `rates`.
+    normal : unit normal of the screen (3).
+    entry : linear resistance along the normal, linear resistance across it, quadratic resistance along it, all per
+        cell and time step, and the `spread` of `of_thin_sheet`.
+    u : velocity without the screen (3).
+    blood : result of `rates`.
     """
     blood = blood[0], blood[1] * squared_reach(normal)
     through = u[0] * normal[0] + u[1] * normal[1] + u[2] * normal[2]
@@ -352,24 +309,7 @@ def resist(normal: Any, entry: Any, u: Any, blood: Any) -> tuple[Any, Any]:
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def collided(f: Any, time: Any, limit: Any, odd_rate: Any) -> tuple[Any, Any, Any]:
-    """Return the collided parts from which `relaxed` computes populations without a screen.
-
-    Parameters
-    ----------
-    f
-        Populations (19).
-    time
-        Relaxation time of the stress.
-    limit
-        Largest grid Reynolds number.
-    odd_rate
-        Relaxation rate of the odd part in slow flow.
-
-    Returns
-    -------
-    tuple
-        Even parts (10), odd parts (9), and half the fraction of the odd part that is kept.
-    """
+    """Return the collided parts from which `relaxed` computes populations without a screen."""
     density, u, flux = moments_of(f)
     keep, rate = _kept_and_rate(u, time, limit, odd_rate)
     n = departure(flux, u)
@@ -384,13 +324,6 @@ def collided_screened(f: Any, time: Any, limit: Any, odd_rate: Any, normal: Any,
     """Return the collided parts of populations in a screen, from which `relaxed` computes them.
 
     The velocity includes half of the force. First and second moments of the force are multiplied by 1 - rate / 2.
-
-    Parameters
-    ----------
-    f, time, limit, odd_rate
-        As in `collided`.
-    normal, entry
-        Screen, as in `resist`.
 
     References
     ----------
@@ -432,12 +365,9 @@ def rescaled(f: Any, stretch: Any, stress: Any) -> tuple[Any, ...]:
 
     Parameters
     ----------
-    f
-        Populations (19), an array.
-    stretch
-        Ratio of the new to the old time step.
-    stress
-        Factor of the stress: `stretch` times the ratio of the relaxation times.
+    f : populations (19), an array.
+    stretch : ratio of the new to the old time step.
+    stress : factor of the stress: `stretch` times the ratio of the relaxation times.
 
     References
     ----------

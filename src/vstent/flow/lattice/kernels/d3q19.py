@@ -351,14 +351,7 @@ def no_screen(segments: int) -> tuple[Ints, Ints, NDArray[np.float32]]:
 def addresses(place: Ints, behind: Sequence[Ints], stride: int) -> Ints:
     """Return the address (2, s, 19) of the first population of every segment and direction, in an even and an odd step.
 
-    Parameters
-    ----------
-    place : (s,) int
-        Storage place of every segment's first cell.
-    behind : 19 arrays (s,) int
-        Storage place of the cell from which each population of this cell streams.
-    stride : int
-        Distance between two populations of a cell.
+    Shapes: `place` (s,), `behind` (s,).
     """
     own = place[:, None] + stride * np.arange(19)
     neighbours = np.stack([OPPOSITE[q] * stride + behind[q] for q in range(19)], axis=1)
@@ -370,19 +363,16 @@ def paths(address: Ints, weight: Floats) -> tuple[Ints, NDArray[np.float32]]:
 
     Parameters
     ----------
-    address : (links, 6) int
-        Addresses after an even step of the populations that leave along the link (a), left the cell behind (b), leave
-        against the link (c), and of the mailbox (d). For `defer`: of those that left the second cell behind (e) and
-        leave the cell behind against the link (g). After an odd step a and d, b and c, e and g change roles.
-    weight : (links, 3)
-        Weights of a, b and c; that of b or of c is zero.
+    address : (links, 6); addresses after an even step of the populations that leave along the link (a), left the cell
+        behind (b), leave against the link (c), and of the mailbox (d). For `defer`: of those that left the second cell
+        behind (e) and leave the cell behind against the link (g). After an odd step a and d, b and c, e and g change
+        roles.
+    weight : (links, 3); weights of a, b and c; that of b or of c is zero.
 
     Returns
     -------
-    path : (2, links, 3) int
-        Addresses read (two) and written (one), after an even and after an odd step.
-    weight : (links, 2) float32
-        Weights of the two populations read.
+    path : (2, links, 3); addresses read (two) and written (one), after an even and after an odd step.
+    weight : (links, 2) float32; weights of the two populations read.
     """
     needs_c = weight[:, 2] != 0
     after_even = np.where(needs_c[:, None], address[:, (0, 2, 3)], address[:, (0, 1, 3)])
@@ -420,18 +410,12 @@ def defer(f: Any, address: Any, correction: Any, source: Any, lost: Any, part: f
 
     Parameters
     ----------
-    f : float32
-        Populations.
-    address : (links, 6) int
-        As in `paths`.
-    correction : (links, 5) float32
-        Weights of a, b, c, e and g.
-    source : (links,) float32
-        Sources, changed in place.
-    lost : (links,) float32
-        Set to the mass that each link loses.
-    part : float
-        Under-relaxation factor.
+    f : float32; populations.
+    address : (links, 6); as in `paths`.
+    correction : (links, 5) float32; weights of a, b, c, e and g.
+    source : (links,) float32; sources, changed in place.
+    lost : (links,) float32; set to the mass that each link loses.
+    part : Under-relaxation factor.
 
     References
     ----------
@@ -460,14 +444,11 @@ def balance(lost: Any, groups: Any, refill: Any, part: float) -> None:
 
     Parameters
     ----------
-    lost : (links,) float32
-        Mass that each wall link loses (see `defer`).
-    groups : tuple
-        (g + 1,) first link of every group, (links,) links sorted by group, and the same two arrays for wall cells.
-    refill : (w,) float32
-        Mass added to every wall cell per step, changed in place.
-    part : float
-        Under-relaxation factor.
+    lost : (links,) float32; mass that each wall link loses (see `defer`).
+    groups : tuple; (g + 1,) first link of every group, (links,) links sorted by group, and the same two arrays for
+        wall cells.
+    refill : (w,) float32; mass added to every wall cell per step, changed in place.
+    part : Under-relaxation factor.
     """
     for g in prange(len(groups[0]) - 1):
         balance_group(g, lost, groups, refill, part)
@@ -540,16 +521,7 @@ def relaxation_times(f: Any, stride: int, places: Any, time: float, law: Any) ->
 def resisted(velocity: Any, entries: Any, times: Any, odd_rate: float) -> Any:
     """Return the half-force velocity (e, 3) of cells in a screen.
 
-    Parameters
-    ----------
-    velocity : (e, 3)
-        Momentum of the populations.
-    entries : (e, ENTRY)
-        Unit normal and resistance (see `resist`).
-    times : (e,)
-        Relaxation times of the stress.
-    odd_rate : float
-        Relaxation rate of the odd part.
+    Shapes: `velocity` (e, 3), `entries` (e, ENTRY), `times` (e,).
     """
     result = np.zeros_like(velocity)
     for e in range(len(entries)):
@@ -649,22 +621,7 @@ def drive(f: Any, stride: int, openings: Any, links: Any, moment: Any, source: A
     Outflow: the density answers an excess of speed like an outgoing wave would, about a mean that changes until there
     is no excess.
 
-    Parameters
-    ----------
-    f : float32
-        Populations.
-    stride : int
-        Distance between two populations of a cell.
-    openings : (k, `OPENING`)
-        Columns from `KIND` (`PRESSURE`, `INFLOW` or `OUTFLOW`) to `DENSITY`. The two densities change in place.
-    links : tuple
-        (k + 1,) first link of every opening in the following arrays; (l, 6) addresses as in `paths`; (l,) storage place
-        of each link's cell; (l,) direction; (m, l, 2) profile coefficients at m moments of a cycle. For an inflow they
-        multiply its speed and its squared speed. For an outlet the first is the local density minus that of the outlet.
-    moment : (3,)
-        The two moments between which these steps lie, and the fraction of the way.
-    source : (l,)
-        Sources of the links, changed in place.
+    Shapes: `links` (k + 1,), `moment` (3,), `source` (l,).
 
     References
     ----------

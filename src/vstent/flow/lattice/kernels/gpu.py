@@ -414,25 +414,7 @@ def even_step(
 
     A launch takes the host some microseconds for every array, so tables share one array of each type.
 
-    Parameters
-    ----------
-    f : (19 * stride,) float32
-        Populations, changed in place.
-    integers : (:,) int32
-        `HEAD` entries (see `NOW`, `SPECIAL`), `Layout.rows`, and in places that these entries and `code_at` tell:
-        `Packed.code`, `Packed.special` with the places of link and screen entry, `Layout.end_of_link`,
-        `Layout.opening_of_end`, and the tables of `drive`.
-    singles : (:,) float32
-        Relaxation time at high shear rate, Carreau-Yasuda law (4), relaxation rate of the odd part (see
-        `d3q19.update`); from `HEAD` on the limits (s,); then `Packed.link`, the refill of special cells, and screen
-        entries (see `collision.resist`).
-    doubles : (:,) float64
-        `Links.openings`; the answer (k,) of every opening from `drive`; the sums of its blocks; the boundary values
-        (rows, k + 3).
-    shape : (m, o, 2) float64
-        `Links.shape`.
-    stride, cells, code_at : int
-        Distance between two populations of a cell, number of cells, and where their codes begin.
+    Shapes: `f` (19 * stride,), `shape` (m, o, 2).
     """
     cell = cuda.grid(1)
     if cell >= cells:
@@ -453,13 +435,6 @@ def odd_step(f: Any, integers: Any, singles: Any, stride: int, cells: int, code_
     """Make an odd step: every cell reads what its neighbours have sent, collides, and stores it in the same places.
 
     The clock moves to the next pair of steps.
-
-    Parameters
-    ----------
-    f, integers, singles, stride, cells, code_at
-        As in `even_step`.
-    keep : int
-        Whether what is sent along links is also written to the mailboxes: 0 at the openings only, 1 everywhere.
     """
     cell = cuda.grid(1)
     if cell == 0:
@@ -535,11 +510,9 @@ def defer(f: Any, integers: Any, singles: Any, part: float) -> None:
 
     Parameters
     ----------
-    f, part
-        As in `d3q19.defer`.
-    integers, singles
-        As in `even_step`. Further integers: `Links.address` (6, l), and the number of each link of the walls in
-        `Packed.link`, or -1 minus this number for a near link. Further singles: the mass lost (walls,), and
+    f, part : as in `d3q19.defer`.
+    integers, singles : as in `even_step`. Further integers: `Links.address` (6, l), and the number of each link of the
+        walls in `Packed.link`, or -1 minus this number for a near link. Further singles: the mass lost (walls,), and
         `Links.correction` of the walls (5, walls).
     """
     w, walls = cuda.grid(1), integers[WALLS]
@@ -580,10 +553,8 @@ def balance(integers: Any, singles: Any, part: float) -> None:
 
     Parameters
     ----------
-    integers, singles
-        As in `defer`. Further integers: `Refill.groups`, whose cells are numbers of special cells.
-    part
-        As in `d3q19.balance`.
+    integers, singles : as in `defer`. Further integers: `Refill.groups`, whose cells are numbers of special cells.
+    part : as in `d3q19.balance`.
     """
     g = cuda.grid(1)
     if g == 0:
@@ -698,10 +669,8 @@ def outflow(
 
     Parameters
     ----------
-    f, integers, singles, stride, code_at
-        As in `even_step`.
-    end_cell, start
-        `Layout.end_cell` and `Layout.end_cell_start`.
+    f, integers, singles, stride, code_at : as in `even_step`.
+    end_cell, start : `Layout.end_cell` and `Layout.end_cell_start`.
     """
     k, t = cuda.blockIdx.x, cuda.threadIdx.x
     parts = cuda.shared.array(THREADS, np.float64)
@@ -720,12 +689,6 @@ def drive(f: Any, integers: Any, singles: Any, doubles: Any, stride: int, code_a
 
     Every block sums over some cells of one opening. The last block of an opening that is done adds these sums, always
     in the same order.
-
-    Parameters
-    ----------
-    f, integers, singles, doubles, stride, code_at
-        As in `even_step`. Further integers: `Layout.blocks` (b, 3), `Layout.end_cell` (j,), the first block (k + 1,)
-        and the number of links (k,) of every opening, and the number of its blocks done (k,), 0 before and after.
     """
     b, t = cuda.blockIdx.x, cuda.threadIdx.x
     block = integers[BLOCKS] + 3 * b

@@ -17,20 +17,14 @@ def spread(index: Any, frame: Any, sheet: Any, number: Any, found: Any, sums: An
 
     Parameters
     ----------
-    index : (i, j, k) int
-        Cell number at every grid point, -1 outside.
-    frame : (4,)
-        Position of grid point 0, 0, 0, and the grid spacing.
-    sheet : tuple
-        Samples (p, 3); unit normals (p, 3); per sample (p,) the area per volume of a cell, the resistance along the
-        normal and across it, and the inertial loss.
-    number : (cells,) int
-        Filled with -1; set to the row of every cell that receives something.
-    found : (cells,) int
-        Set to the cell of every row.
-    sums : (cells, `COLUMNS`)
-        Filled with zeros. The sums over the samples of every row, per volume: normal (3), resistance along and across
-        it, square of the latter times `_twice`, inertial loss.
+    index : (i, j, k); cell number at every grid point, -1 outside.
+    frame : (4,); position of grid point 0, 0, 0, and the grid spacing.
+    sheet : tuple; samples (p, 3); unit normals (p, 3); per sample (p,) the area per volume of a cell, the resistance
+        along the normal and across it, and the inertial loss.
+    number : (cells,); filled with -1; set to the row of every cell that receives something.
+    found : (cells,); set to the cell of every row.
+    sums : (cells, `COLUMNS`); filled with zeros. The sums over the samples of every row, per volume: normal (3),
+        resistance along and across it, square of the latter times `_twice`, inertial loss.
     """
     points, normals, area, along, across, loss = sheet
     cells, weights, height = np.zeros(8, np.int32), np.zeros(8), np.zeros(8)
