@@ -86,9 +86,10 @@ def prominence_of_surface(surface: Surface) -> float:
     vertices, faces = triangles.cap(surface.vertices_mm, surface.faces, surface.boundary_loops)
     corners_mm = vertices[faces]
     volume_mm3 = triangles.volume(corners_mm)
-    edge_mm = 4 * abs(volume_mm3) / surface.area_mm2 / VOXELS_ACROSS
+    extent_mm = np.ptp(corners_mm, axis=(0, 1))
+    edge_mm = max(4 * abs(volume_mm3) / surface.area_mm2 / VOXELS_ACROSS, (extent_mm.prod() / MOST_VOXELS) ** (1 / 3))
     low = corners_mm.min(axis=(0, 1)) - edge_mm
     shape = np.ceil((corners_mm.max(axis=(0, 1)) + edge_mm - low) / edge_mm).astype(int) + 1
     corners = (corners_mm if volume_mm3 > 0 else corners_mm[:, ::-1]) - low
     inside = voxels.fill(corners / edge_mm, (int(shape[0]), int(shape[1]), int(shape[2])))
-    return prominence(inside, np.full(3, edge_mm))
+    return prominence(inside, np.full(3, edge_mm)) if inside.any() else 0.0
