@@ -634,7 +634,7 @@ def test_a_setting_that_the_page_does_not_take_is_named(flown, tmp_path):
     folder, told = flown
     told["settings"]["flow"]["numerics"]["cell_size_mm"] = 0.03
     (folder / "run.json").write_text(json.dumps(told))
-    with pytest.raises(ReadError, match=r"flow.cell_size_mm = 0.03.*vstent run"):
+    with pytest.raises(ReadError, match=r"grid spacing: 0.03 mm is out of range.*vstent run"):
         Desk(Store(tmp_path / "cases")).open(folder)
 
 

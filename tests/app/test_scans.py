@@ -12,7 +12,7 @@ from vstent.app.scans import Scan
 from vstent.errors import InputError
 from vstent.geometry.image import Image
 from vstent.study.keys import anatomy_keys
-from vstent.study.settings import Settings
+from vstent.study.settings import InputSettings, Settings
 
 SPACING_MM = np.array([0.7, 0.4, 1.1])
 SHAPE = (46, 62, 34)
@@ -84,7 +84,7 @@ def test_wires_are_cut_where_they_cross_the_plane(image):
 
 def test_the_message_names_every_outline(image):
     stent = report_case.deployment("silk", 24).stent
-    manifest, data = app_case.opened(_Answer(outlines(image, report_case.anatomy(), stent, 1, 30)))
+    manifest, data = app_case.opened(_Answer(outlines(image, report_case.anatomy(), [stent], 1, 30)))
     assert set(manifest["segments"]) == {"lumen", "parent", "sac", "neck"}
     packed = app_case.numbers(manifest["segments"]["lumen"], data)
     exact = section(image, report_case.anatomy().vessel.lumen, 1, 30).reshape(-1, 4)
@@ -103,7 +103,7 @@ def test_a_cropped_scan_is_a_part_that_lies_where_it_lay(image):
 
 
 def test_keys_change_with_the_crop_box():
-    cropped = replace(Settings(), crop_mm=((0.0, 0, 0), (9.0, 9, 9)))
+    cropped = Settings(input=InputSettings(crop_mm=((0.0, 0, 0), (9.0, 9, 9))))
     before, after = (anatomy_keys("source", settings) for settings in (Settings(), cropped))
     assert {name for name in before if before[name].given != after[name].given} == {"vessel", "anatomy"}
     assert {name: key.code for name, key in before.items()} == {name: key.code for name, key in after.items()}

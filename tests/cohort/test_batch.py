@@ -309,8 +309,8 @@ def test_outliers_are_found_by_the_modified_z_score():
     away = np.abs(np.array(values) - 3.5)
     wanted = 0.6745 * (np.array(values) - 3.5) / np.median(away)
     assert modified_z_scores(values) == pytest.approx(wanted)
-    key = "deployment.deployed_length_mm"
-    rows = [{"case": f"<c{i}>", "device": "silk", "outcome": "done", key: v} for i, v in enumerate(values)]
+    key = "implant.deployed_length_mm"
+    rows = [{"case": f"<c{i}>", "treatment": "silk", "outcome": "done", key: v} for i, v in enumerate(values)]
     page = cohort_report("x", rows)
     outliers = page[page.index('id="outliers"') : page.index('id="failures"')]
     assert re.findall(r'<th scope="row">(.*?)</th>', outliers) == ["&lt;c5&gt;"]

@@ -237,7 +237,7 @@ def test_outlets_share_what_all_inlets_bring() -> None:
     case = vessel_case(vessel, FlowSettings(inflow_mL_s=4.0, outlets="murray"))
     cubes = np.array([outlet.diameter_mm**3 for outlet in vessel.outlets])
     flows_mL_s = 4.0 * cubes / cubes.sum()
-    assert case.ends[3:] == (Pressure(0.0), *(FlowRate(pytest.approx(one)) for one in flows_mL_s[1:]))
+    assert case.ends[2:] == (Pressure(0.0), *(FlowRate(pytest.approx(one)) for one in flows_mL_s[1:]))
 
 
 def test_every_inlet_has_a_number_and_streamlines_of_its_own() -> None:
@@ -342,6 +342,6 @@ def test_a_study_keeps_its_inlets_from_the_command_line_to_the_numbers_and_back(
 
 def test_the_page_keeps_the_inlets_of_a_study_that_it_opens(study: Path, tmp_path: Path) -> None:
     case = reopened(Store(tmp_path), study)
-    told = json.loads((study / "run.json").read_text())["settings"]["inlet_mm"]
+    told = json.loads((study / "run.json").read_text())["settings"]["anatomy"]["inlet_mm"]
     assert case.state.choices.model_dump(mode="json")["inlet_mm"] == told
-    assert np.array(case.state.settings().inlet_mm).tolist() == told == at_ends(RIGHT, LEFT).tolist()
+    assert np.array(case.state.settings().anatomy.inlet_mm).tolist() == told == at_ends(RIGHT, LEFT).tolist()

@@ -157,9 +157,7 @@ def test_the_numbers_of_the_device_vary_within_their_ranges():
     assert vary(artery(), lies, Ranges(2, numbers_factor=0.0, **still)).interval("deployed_length_mm")[1:] == (
         pytest.approx(2 * (lies.stent.deployed_length_mm,), rel=1e-9)
     )
-    (half,) = (
-        one for one in uncertainty.numbers_of(Ranges(numbers_factor=0.5), design) if one.name == "braid_angle_rad"
-    )
+    (half,) = (one for one in Ranges(numbers_factor=0.5).numbers_of(design) if one.name == "braid_angle_rad")
     (whole,) = (one for one in uncertain(design) if one.name == "braid_angle_rad")
     middle = design.angle_rad
     assert (half.low, half.high) == pytest.approx(((middle + whole.low) / 2, (middle + whole.high) / 2))

@@ -186,7 +186,7 @@ def test_settings_of_another_version_are_refused(path):
     """One more setting anywhere, or one less."""
     for change in (lambda told: told.update(colour="red"), lambda told: told.pop(next(iter(told)))):
         section = told = json.loads(json.dumps(asdict(ALL)))
-        for name in path.split():
+        for name in path:
             section = section[name]
         change(section)
         with pytest.raises(ValueError, match="settings"):

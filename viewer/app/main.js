@@ -374,7 +374,7 @@ class Page {
     return treatments.find(({ name }) => name === this.active) ?? treatments[0];
   }
 
-  /** The implant of it that is told of and moved. */
+  /** The implant of it that is described and moved. */
   get implant() {
     const implants = this.treatment?.implants;
     return implants?.find(({ id }) => id === this.activeImplant) ?? implants?.[0];

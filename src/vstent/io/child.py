@@ -1,5 +1,6 @@
 """Read a file with limited memory and time and save its arrays; `vstent.io.apart` starts this module."""
 
+import errno
 import json
 import struct
 import sys
@@ -57,7 +58,7 @@ def main(what: str, path: Path, options: dict[str, Any], folder: Path, limits: d
     try:
         arrays, words = READERS[what](path, options)
         for name, values in arrays.items():
-            np.save(folder / f"{name}.npy", values)
+            _save(folder / f"{name}.npy", values)
     except VstentError as error:
         words = {"error": type(error).__name__, "sentence": str(error)}
     except MemoryError:
@@ -68,6 +69,14 @@ def main(what: str, path: Path, options: dict[str, Any], folder: Path, limits: d
         reason = " ".join(str(error).split())[:120]
         words = {"error": "ReadError", "sentence": f"{path.name} is damaged ({reason}). Copy or export it again."}
     (folder / WORDS).write_text(json.dumps(words), encoding="utf-8")
+
+
+def _save(path: Path, values: NDArray[Any]) -> None:
+    """Save an array; NumPy gives the error of a full disk no number."""
+    try:
+        np.save(path, values)
+    except OSError as error:
+        raise OSError(error.errno or errno.ENOSPC, str(error), str(path)) from error
 
 
 def limit(memory: float, seconds: float) -> bool:

@@ -104,9 +104,9 @@ def atomic(path: Path) -> Iterator[Path]:
 
 
 def sweep(folder: Path) -> None:
-    """Remove half-written files of killed processes from a folder and two levels below it."""
-    for depth in ("", "*/", "*/*/"):
-        for partial in folder.glob(f"{depth}{PARTIAL}*"):
+    """Remove half-written files of killed processes from a folder and four levels below it."""
+    for depth in range(5):
+        for partial in folder.glob(f"{'*/' * depth}{PARTIAL}*"):
             if partial.is_file() and not _is_running(partial.name[len(PARTIAL) :].partition("-")[0]):
                 partial.unlink(missing_ok=True)
 

@@ -382,7 +382,7 @@ def refine(out: Path, anatomy: Anatomy, settings: Settings, store: Store) -> Sen
     store : results of the study.
     """
     flow = settings.flow or FlowSettings()
-    _plan(anatomy, {}, flow, store)
+    _plan(anatomy, {BARE: ()}, flow, store)
     with store.stage("convergence") as tell:
         done: list[str] = []
 

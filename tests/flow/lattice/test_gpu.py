@@ -355,6 +355,7 @@ def test_the_command_line_says_so_before_it_reads_anything(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(gpus, "find_spec", lambda name: None)
+    (tmp_path / "a.stl").touch()
     for command in ("run", "flow", "batch"):
         assert main([command, str(tmp_path), "--out", str(tmp_path / "out"), "--gpu"]) == 1
         assert "numba-cuda is not installed" in " ".join(capsys.readouterr().err.split())
@@ -396,7 +397,7 @@ def test_a_record_keeps_that_a_run_was_on_a_gpu_and_on_which(monkeypatch: pytest
     assert told["machine"]["gpu"] == "A100"
     again = repeat.settings_of(json.loads(json.dumps(told["settings"])))
     assert again.flow is not None
-    assert again.flow.device_gpu
+    assert again.flow.numerics.device_gpu
     monkeypatch.setattr(gpus, "find_spec", lambda name: None)
     assert "gpu (machine): A100 before, none now" in repeat._differences(told, again)
     assert "gpu" not in machine(Settings())
