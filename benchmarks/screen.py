@@ -2,7 +2,7 @@
 
 Usage: python benchmarks/screen.py [--quick]
 
-Every row is a periodic cell of two families of wires (`vstent.flow.lattice.crossing_cell`). `crossing_factor` is the
+Every row is a periodic cell of two families of wires (`tests/helpers/crossing_cell.py`). `crossing_factor` is the
 viscous resistance to blood driven straight through, over the sum of two rows of such wires, each computed alike;
 `row_over_law` is such a row's over that of Tamada and Fujikawa (1957): what the grid gets wrong. The others are of
 blood that passes at an angle, some three times as fast along the wires as through them, at a wire Reynolds number of a
@@ -18,7 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from vstent.flow.drag import crossing_factor, drag_per_length, inertial_loss, tangential_share
-from vstent.flow.lattice.crossing_cell import VISCOSITY, Wires, crossing_wires, flow_through, row_of_wires, sheet_speed
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
+from crossing_cell import VISCOSITY, Wires, crossing_wires, flow_through, row_of_wires, sheet_speed
 
 TABLE = Path(__file__).with_suffix(".json")
 CELLS = (

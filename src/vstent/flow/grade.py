@@ -17,8 +17,6 @@ from vstent.geometry.vessel import Opening
 from vstent.kernels.arrays import Floats
 from vstent.units import M_PER_MM
 
-QUALITY: Final = "flow_quality"
-"""Key of the grades of all flows in the metrics of a case."""
 Level = Literal["good", "fair", "not usable"]
 GOOD: Final = "good"
 FAIR: Final = "fair"

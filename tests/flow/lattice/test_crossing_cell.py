@@ -2,9 +2,7 @@
 
 import numpy as np
 import pytest
-
-from vstent.flow.drag import drag_per_length, round_diameter
-from vstent.flow.lattice.crossing_cell import (
+from crossing_cell import (
     VISCOSITY,
     CellFlow,
     Wires,
@@ -13,6 +11,8 @@ from vstent.flow.lattice.crossing_cell import (
     row_of_wires,
     sheet_speed,
 )
+
+from vstent.flow.drag import drag_per_length, round_diameter
 
 DIAMETER = 6
 
@@ -58,10 +58,8 @@ def test_a_row_of_square_struts_holds_blood_up_as_round_wires_of_their_round_dia
         return np.array([along, through])
 
     round_wires = speeds(row_of_wires(spacing, spacing, round_diameter(side, side)))
-    monkeypatch.setattr("vstent.flow.lattice.crossing_cell._blood", is_outside)
-    monkeypatch.setattr(
-        "vstent.flow.lattice.crossing_cell._fractions", lambda _, cells, steps: np.full(len(cells), 0.5)
-    )
+    monkeypatch.setattr("crossing_cell._blood", is_outside)
+    monkeypatch.setattr("crossing_cell._fractions", lambda _, cells, steps: np.full(len(cells), 0.5))
     np.testing.assert_allclose(speeds(row_of_wires(spacing, spacing, side)), round_wires, rtol=0.015)
 
 
