@@ -50,7 +50,7 @@ def told(vessel: Vessel, path: int, bulges: list[Bulge], aneurysms: tuple[Aneury
 
 
 def necks_told(aneurysms: Sequence[Aneurysm]) -> tuple[str, ...]:
-    """Return notes on necks whose plane is uncertain, or missing."""
+    """Return notes on sacs whose neck is cut by an uncertain plane, or that have no plane."""
     notes = []
     for aneurysm in aneurysms:
         if aneurysm.plane is None:
@@ -60,7 +60,8 @@ def necks_told(aneurysms: Sequence[Aneurysm]) -> tuple[str, ...]:
             )
             continue
         low_mm2, high_mm2 = aneurysm.plane.area_band_mm2
-        if high_mm2 > UNCERTAIN * low_mm2:
+        is_cut = np.array_equal(aneurysm.neck_mm, aneurysm.plane.rim_mm)
+        if is_cut and high_mm2 > UNCERTAIN * low_mm2:
             notes.append(
                 f"The neck is uncertain: its area is {aneurysm.plane.area_mm2:.1f} mm2, and {low_mm2:.1f} to "
                 f"{high_mm2:.1f} mm2 for planes that separate the sac nearly as well."
