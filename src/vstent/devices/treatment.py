@@ -16,7 +16,8 @@ BARE: Final = "bare"
 NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,59}")
 """Form of the names of treatments and implants, which name folders."""
 
-IMPLANT: Final = re.compile(r"([\w-]+)(?:\s+([\d.]+)\s*x\s*([\d.]+))?(?:\s*@\s*([+-]?[\d.]+))?")
+_SIZE: Final = r"\d+(?:\.\d*)?"
+IMPLANT: Final = re.compile(rf"([\w-]+)(?:\s+({_SIZE})\s*x\s*({_SIZE}))?(?:\s*@\s*([+-]?{_SIZE}))?")
 """Form of an implant in the text of a treatment: device, label diameter x length in mm, @ shift in mm."""
 
 
@@ -89,7 +90,7 @@ class Treatment:
 
     def __post_init__(self) -> None:
         _check_name("treatment", self.name)
-        if self.name == BARE and self.implants:
+        if self.name.casefold() == BARE and self.implants:
             raise InputError(f"The treatment {BARE!r} is the artery without an implant: choose another name.")
         known: list[str] = []
         for implant in self.implants:
@@ -152,10 +153,11 @@ def read_treatment(text: str) -> Treatment:
                 f"{part.strip()!r} is not an implant: write a device, its size and its shift such as 'silk 4x20 @-4'"
             )
         device, diameter, length, shift = found.groups()
-        count = sum(one.device == device for one in implants)
+        device = device.lower()
+        ids = (device, *(f"{device}_{number}" for number in range(2, len(implants) + 2)))
         implants.append(
             Implant(
-                device if count == 0 else f"{device}_{count + 1}",
+                next(name for name in ids if name not in {one.id for one in implants}),
                 device,
                 float(diameter) if diameter else None,
                 float(length) if length else None,

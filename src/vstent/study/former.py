@@ -14,7 +14,7 @@ from vstent.devices.treatment import Treatment
 from vstent.errors import InputError
 from vstent.fields import differing
 from vstent.io.writers import write_json
-from vstent.study.folder import CACHE, RUN
+from vstent.study.folder import CACHE, RUN, TREATMENTS
 from vstent.study.repeat import former_source, settings_of
 from vstent.study.settings import Settings
 from vstent.study.store import UNREADABLE
@@ -63,6 +63,8 @@ def merged(out: Path, source: str, settings: Settings) -> Settings:
     treatments = []
     for name in {**before, **now}:
         old, new = before.get(name), now.get(name)
+        if new and not (out / TREATMENTS / name).exists():  # the old one failed, or was not reached
+            old = None
         one = _same(out, f"sizes or places of {name}", old and replace(old, has_flow=True), _of_use(old, new))
         had_flow = old is not None and old.has_flow and former.flow is not None
         gets_flow = new is not None and new.has_flow and settings.flow is not None

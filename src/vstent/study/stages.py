@@ -190,7 +190,12 @@ def _deployed(treatment: Treatment, anatomy: Anatomy, store: Store, keys: Mappin
         deployment = store.find(stage, keys[stage], Deployment)
         if deployment is None:
             with store.stage(stage) as tell:
-                deployment = deploy_implant(implant, anatomy, [found[name].stent for name in implant.inside])
+                try:
+                    deployment = deploy_implant(implant, anatomy, [found[name].stent for name in implant.inside])
+                except (DeviceError, LandingError) as error:
+                    if len(treatment.implants) == 1:
+                        raise
+                    raise type(error)(f"{implant.id}, an implant of {treatment.name}: {error}") from error
                 tell(deployment.advice)
             store.hold(stage, keys[stage], deployment)
         found[implant.id] = deployment
