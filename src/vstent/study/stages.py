@@ -422,10 +422,12 @@ def vary_all(
     flow = settings.flow if settings.uncertainty.flow_samples else None
     found = {}
     for treatment in settings.treatments:
-        if len(implants.get(treatment.name, ())) != 1:
+        stage, deployed = f"vary {treatment.name}", implants.get(treatment.name, {})
+        if len(deployed) > 1:
+            store.progress(stage, 1.0, "left out: only treatments of one implant are varied.")
+        if len(deployed) != 1:
             continue
-        (deployment,) = implants[treatment.name].values()
-        stage = f"vary {treatment.name}"
+        (deployment,) = deployed.values()
         varied = store.find(stage, keys[stage], Uncertainty)
         if varied is None:
             with store.stage(stage) as tell:
