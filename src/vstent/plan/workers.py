@@ -5,12 +5,13 @@ Processes are used instead of threads because compiled kernels that run in paral
 
 import multiprocessing
 import pickle
+import shutil
 import signal
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Final, TypeVar
 
 from vstent.children import spawning
@@ -47,10 +48,12 @@ def spread(
         return
     # Processes are spawned because a fork copies locks that other threads hold.
     context = multiprocessing.get_context("spawn")
-    with TemporaryDirectory() as folder:
+    # A TemporaryDirectory would warn where this generator is collected before its end.
+    folder = Path(tempfile.mkdtemp(prefix="vstent-"))
+    try:
         # Passed in a file: data too long for a pipe would block this process forever if a worker died
         # before reading them.
-        path = Path(folder) / "common.pickle"
+        path = folder / "common.pickle"
         path.write_bytes(pickle.dumps((work, common)))
         with spawning():
             pool = ProcessPoolExecutor(min(jobs, len(items)), context, _start, (path,))
@@ -63,6 +66,8 @@ def spread(
             ) from error
         finally:
             pool.shutdown(cancel_futures=True)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _start(path: Path) -> None:
