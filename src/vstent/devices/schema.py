@@ -3,7 +3,7 @@
 import tomllib
 from collections.abc import Iterator
 from itertools import pairwise
-from typing import Annotated, Final, Generic, Literal, Self, TypeVar
+from typing import Annotated, Any, Final, Generic, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -97,18 +97,21 @@ class _Wires(_Sourced):
 
     def ranges(self, name: str) -> Iterator[Range]:
         """Yield the ranges of the numbers of wires called `name`."""
-        for key in type(self).model_fields:
-            number = getattr(self, key)
-            if isinstance(number, _Number):
-                yield _range(f"{name}_{key}", number, self)
+        for key, number in self._numbers():
+            yield _range(f"{name}_{key}", number, self)
 
     def facts(self, name: str, number: int = 0) -> Iterator[Fact]:
         """Yield the source of a group of `name`, counted from 0, and those of numbers that have their own."""
         yield _fact(name, self)
-        for key in type(self).model_fields:
-            one = getattr(self, key)
-            if isinstance(one, _Number) and one.source is not None and one.confidence is not None:
+        for key, one in self._numbers():
+            if one.source is not None and one.confidence is not None:
                 yield Fact(f"{nth(name, number)}_{key}", one.source, one.confidence)
+
+    def _numbers(self) -> Iterator[tuple[str, _Number[Any]]]:
+        """Yield the numbers with the names of their fields."""
+        for key in type(self).model_fields:
+            if isinstance(one := getattr(self, key), _Number):
+                yield key, one
 
 
 class _Layer(_Wires):

@@ -16,8 +16,9 @@ BARE: Final = "bare"
 NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,59}")
 """Form of the names of treatments and implants, which name folders."""
 
-_SIZE: Final = r"\d+(?:\.\d*)?"
-IMPLANT: Final = re.compile(rf"([\w-]+)(?:\s+({_SIZE})\s*x\s*({_SIZE}))?(?:\s*@\s*([+-]?{_SIZE}))?")
+_NUMBER: Final = r"\d+(?:\.\d*)?"
+"""Form of a number without a sign."""
+IMPLANT: Final = re.compile(rf"([\w-]+)(?:\s+({_NUMBER})\s*x\s*({_NUMBER}))?(?:\s*@\s*([+-]?{_NUMBER}))?")
 """Form of an implant in the text of a treatment: device, label diameter x length in mm, @ shift in mm."""
 
 

@@ -11,17 +11,18 @@ from typing import Any, Final
 
 from vstent.angiography.angiogram import Angiogram, AngiogramSettings, Watch, angiogram
 from vstent.devices.treatment import BARE
-from vstent.errors import InputError, ReadError
+from vstent.errors import InputError
 from vstent.flow.case import FlowField
 from vstent.flow.indices import ratios
 from vstent.geometry.vessel import Anatomy
 from vstent.io.tables import write_rows
 from vstent.io.writers import write_json
 from vstent.study.folder import CACHE, claimed
-from vstent.study.keys import ANATOMY, angiogram_key, study_keys
+from vstent.study.keys import angiogram_key, study_keys
 from vstent.study.progress import OnProgress
 from vstent.study.provenance import METRICS
 from vstent.study.repeat import finished_run
+from vstent.study.stages import finished_anatomy
 from vstent.study.store import UNREADABLE, Key, Store
 
 FOLDER: Final = "angiogram"
@@ -65,9 +66,7 @@ def angiograms(
     with claimed(out):
         store = Store(out / CACHE, progress)
         keys = study_keys(source, study)
-        anatomy = store.find(ANATOMY, keys[ANATOMY], Anatomy)
-        if anatomy is None:
-            raise ReadError(f"{out} does not hold the artery of its run: give the same command as for that run again")
+        anatomy = finished_anatomy(out, store, keys)
         flows = _flow_keys(keys)
         found = {name: _one(out, anatomy, name, key, settings, store, record) for name, key in flows.items()}
         _write(out, found, settings, flows)

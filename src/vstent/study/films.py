@@ -8,13 +8,12 @@ from pathlib import Path
 from vstent.angiography.angiogram import AngiogramSettings, Watch, entering
 from vstent.angiography.history import History, Recorder
 from vstent.devices.stent import Stent
-from vstent.errors import ReadError
 from vstent.flow.case import FlowField
 from vstent.geometry.vessel import Anatomy
 from vstent.study.folder import CACHE
-from vstent.study.keys import ANATOMY, angiogram_key, study_keys
+from vstent.study.keys import angiogram_key, study_keys
 from vstent.study.repeat import finished_run
-from vstent.study.stages import deploy_all
+from vstent.study.stages import deploy_all, finished_anatomy
 from vstent.study.store import Key, Store
 
 
@@ -66,9 +65,7 @@ def stents_of(out: Path, names: Iterable[str]) -> tuple[Anatomy, dict[str, list[
     """
     source, study = finished_run(out)
     store, keys = Store(out / CACHE), study_keys(source, study)
-    anatomy = store.peek(ANATOMY, keys[ANATOMY], Anatomy)
-    if anatomy is None:
-        raise ReadError(f"{out} does not hold the artery of its run: give the same command as for that run again")
+    anatomy = finished_anatomy(out, store, keys)
     chosen = replace(study, treatments=tuple(one for one in study.treatments if one.name in set(names)))
     deployed = deploy_all(anatomy, chosen, store, keys)[0] if chosen.treatments else {}
     return anatomy, {name: [one.stent for one in found.values()] for name, found in deployed.items()}

@@ -23,7 +23,7 @@ from vstent.devices.design import Size
 from vstent.devices.ranges import how_sure
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.devices.treatment import BARE, Implant, Treatment
-from vstent.errors import DeviceError, FlowError, InputError, LandingError, VstentError
+from vstent.errors import DeviceError, FlowError, InputError, LandingError, ReadError, VstentError
 from vstent.flow.beside import Beside
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.convergence import Sensitivity, convergence
@@ -159,6 +159,14 @@ def _vessel(path: Path, settings: Settings) -> Vessel:
     return read_vessel(path, **asdict(settings.input), at_mm=at_mm)
 
 
+def finished_anatomy(out: Path, store: Store, keys: Mapping[str, Key]) -> Anatomy:
+    """Return the stored anatomy of a finished run of a case folder; ReadError is raised where it is missing."""
+    anatomy = store.find(ANATOMY, keys[ANATOMY], Anatomy)
+    if anatomy is None:
+        raise ReadError(f"{out} does not hold the artery of its run: give the same command as for that run again")
+    return anatomy
+
+
 def deploy_all(
     anatomy: Anatomy, settings: Settings, store: Store, keys: Mapping[str, Key]
 ) -> tuple[dict[str, dict[str, Deployment]], dict[str, str]]:
@@ -193,9 +201,9 @@ def _deployed(treatment: Treatment, anatomy: Anatomy, store: Store, keys: Mappin
                 try:
                     deployment = deploy_implant(implant, anatomy, [found[name].stent for name in implant.inside])
                 except (DeviceError, LandingError) as error:
-                    if len(treatment.implants) == 1:
-                        raise
-                    raise type(error)(f"{implant.id}, an implant of {treatment.name}: {error}") from error
+                    if len(treatment.implants) > 1:
+                        error.args = (f"{implant.id}, an implant of {treatment.name}: {error}",)
+                    raise
                 tell(deployment.advice)
             store.hold(stage, keys[stage], deployment)
         found[implant.id] = deployment

@@ -71,6 +71,8 @@ def silent(progress: Progress) -> None:
 class Store:
     """Measures the time of the stages, reports their progress, and stores and finds their results.
 
+    Every result has a name and a key. It is a data class of vstent, or plain values.
+
     Parameters
     ----------
     folder : cache folder of the case.
@@ -141,14 +143,7 @@ class Store:
     # -- data classes --------------------------------------------------------------------------------------------------
 
     def find(self, name: str, key: Key, kind: type[Kept]) -> Kept | None:
-        """Return the result stored under a key, report it and add its run time; None where it is missing or damaged.
-
-        Parameters
-        ----------
-        name : name of the result.
-        key : key of the result.
-        kind : data class of the result.
-        """
+        """Return the result stored under a key, report it and add its run time; None where it is missing or damaged."""
         self._before[name] = set(self.seconds)
         record = self.record(name, key)
         if not record:
@@ -160,14 +155,7 @@ class Store:
         return result
 
     def peek(self, name: str, key: Key, kind: type[Kept]) -> Kept | None:
-        """Return the result stored under a key, without a report of it; None where it is missing or damaged.
-
-        Parameters
-        ----------
-        name : name of the result.
-        key : key of the result.
-        kind : data class of the result.
-        """
+        """Return the result stored under a key, without a report of it; None where it is missing or damaged."""
         from vstent.io.archive import load_data
 
         with suppress(OSError, VstentError):
@@ -175,14 +163,7 @@ class Store:
         return None
 
     def hold(self, name: str, key: Key, result: Any) -> None:
-        """Keep a result in memory until `settle` is called, because a later input may still prove unusable.
-
-        Parameters
-        ----------
-        name : name of the result.
-        key : key of the result.
-        result : a data class of vstent.
-        """
+        """Keep a result in memory until `settle` is called, because a later input may still prove unusable."""
         self._held.append((name, self.keeping(name, key, result)))
 
     def is_held(self, name: str) -> bool:
@@ -196,25 +177,11 @@ class Store:
         self._held.clear()
 
     def keep(self, name: str, key: Key, result: Any) -> None:
-        """Store a result under a key; older results of the same name are deleted after that.
-
-        Parameters
-        ----------
-        name : name of the result.
-        key : key of the result.
-        result : a data class of vstent.
-        """
+        """Store a result under a key; older results of the same name are deleted after that."""
         self.keeping(name, key, result)()
 
     def keeping(self, name: str, key: Key, result: Any) -> Callable[[], None]:
-        """Return a function that does what `keep` does, with the run times of the stages until now.
-
-        Parameters
-        ----------
-        name : name of the result.
-        key : key of the result.
-        result : a data class of vstent.
-        """
+        """Return a function that does what `keep` does, with the run times of the stages until now."""
         since = {stage: took for stage, took in self.seconds.items() if stage not in self._before.get(name, ())}
         return partial(self._keep, name, key, result, since)
 
