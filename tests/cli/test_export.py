@@ -44,6 +44,21 @@ def test_where_a_device_lies_is_not_guessed(studied: Path, tmp_path: Path, capsy
     assert not (tmp_path / "foam").exists()
 
 
+def test_a_case_of_an_older_version_is_refused_and_nothing_of_it_is_touched(
+    studied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old = shutil.copytree(studied, tmp_path / "old")
+    run_record = json.loads((old / "run.json").read_text()) | {"layout": -1}
+    (old / "run.json").write_text(json.dumps(run_record))
+    before = {file: file.read_bytes() for file in old.rglob("*") if file.is_file()}
+    assert main(["export", "patches", str(old), "--out", str(tmp_path / "patches")]) == 2
+    assert "an older version of vstent. Run its study again into another folder" in " ".join(
+        capsys.readouterr().err.split()
+    )
+    assert {file: file.read_bytes() for file in old.rglob("*") if file.is_file()} == before
+    assert not (tmp_path / "patches").exists()
+
+
 def test_patches_of_a_studied_case_are_watertight(studied: Path, tmp_path: Path) -> None:
     out = tmp_path / "patches"
     assert main(["export", "patches", str(studied), "--out", str(out)]) == 0

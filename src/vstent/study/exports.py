@@ -21,7 +21,7 @@ from vstent.flow.problem import flow_case
 from vstent.geometry.vessel import Anatomy
 from vstent.io import writers
 from vstent.io.archive import load_data
-from vstent.study.folder import CACHE, RUN
+from vstent.study.folder import CACHE, RUN, refuse_older
 from vstent.study.keys import anatomy_keys, hash_of
 from vstent.study.progress import OnProgress
 from vstent.study.repeat import finished_run
@@ -112,6 +112,7 @@ def _middle(corners_mm: np.ndarray) -> dict[str, Any]:
 
 def _anatomy(path: Path, settings: Settings, store: Store) -> Anatomy:
     """Return the anatomy stored in a case folder, or that of an input."""
+    refuse_older(path, "Run its study again into another folder, and export that.")
     kept = sorted((path / CACHE).glob("anatomy-*.npz")) if path.is_dir() else []
     if not kept:
         return find_anatomy(path, settings, store, anatomy_keys(hash_of(path), settings))

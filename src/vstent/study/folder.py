@@ -60,14 +60,12 @@ def flow_folder(out: Path, treatment: str) -> Path:
     return out / TREATMENTS / treatment / "flow"
 
 
-def refuse_older(out: Path) -> None:
+def refuse_older(out: Path, remedy: str = "Give another --out, or delete that folder.") -> None:
     """Raise ReadError where a folder is a case folder of another layout."""
     for path in (out / CACHE / INPUT, out / RUN):
         with suppress(*UNREADABLE):
             if json.loads(path.read_text(encoding="utf-8")).get("layout") != LAYOUT:
-                raise ReadError(
-                    f"{out} was written by an older version of vstent. Give another --out, or delete that folder."
-                )
+                raise ReadError(f"{out} was written by an older version of vstent. {remedy}")
 
 
 @contextmanager
