@@ -10,6 +10,7 @@ import pytest
 from faults import artery, image_file, scan
 
 from vstent.errors import ReadError, VstentError
+from vstent.io import apart, child
 from vstent.io.images import read_image
 from vstent.io.scans import read_scan
 from vstent.io.surfaces import read_surface
@@ -51,13 +52,60 @@ def test_a_child_returns_what_its_readers_return(tmp_path):
     np.testing.assert_array_equal(mesh[0].corners_mm, read_mesh(tmp_path / "a.stl").vertices[mesh[0].faces])
 
 
-def test_a_child_that_does_not_start_is_no_fault_of_the_file(tmp_path, monkeypatch):
+@pytest.fixture
+def python(tmp_path, monkeypatch):
+    """Let a shell script run in place of Python; ``$6`` is the folder into which the child writes."""
     (tmp_path / "a.nrrd").write_bytes(image_file(".nrrd"))
-    script = tmp_path / "python"
-    script.write_text("#!/bin/sh\necho no module >&2\nexit 1\n")
-    script.chmod(0o755)
-    monkeypatch.setattr(sys, "executable", str(script))
-    with pytest.raises(VstentError, match=r"failed \(no module\)\. Check the installation"):
+
+    def run(lines):
+        script = tmp_path / "python"
+        script.write_text(f"#!/bin/sh\n{lines}\n")
+        script.chmod(0o755)
+        monkeypatch.setattr(sys, "executable", str(script))
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("lines", "why"),
+    [
+        ("echo no module >&2\nexit 1", r"no module"),
+        ("kill -9 $$", "no reason stated"),
+        ("exec sleep 100", r"it did not start within 1 s"),
+        ('touch "$6/begun"\necho no space >&2\nexit 1', "no space"),
+    ],
+)
+def test_a_child_that_does_not_start_is_no_fault_of_the_file(tmp_path, monkeypatch, python, lines, why):
+    python(lines)
+    monkeypatch.setattr(apart, "START_SECONDS", 1.0)
+    monkeypatch.setattr(apart, "SECONDS", 0.1)
+    with pytest.raises(VstentError, match=rf"failed \({why}\)\. Check the installation") as fault:
+        read_image(tmp_path / "a.nrrd")
+    assert not isinstance(fault.value, ReadError)
+
+
+def test_a_child_that_dies_while_it_reads_says_that_the_file_is_damaged(tmp_path, python):
+    python('touch "$6/begun"\nkill -9 $$')
+    with pytest.raises(ReadError, match=r"a\.nrrd is damaged"):
+        read_image(tmp_path / "a.nrrd")
+
+
+def test_time_to_start_is_no_time_of_reading(tmp_path, monkeypatch, python):
+    """Python starts after 4 s; reading may take 3 s."""
+    monkeypatch.setattr(apart, "SECONDS", 3.0 / child.PATIENCE)
+    python(f'sleep 4\nexec {sys.executable} "$@"')
+    assert read_image(tmp_path / "a.nrrd").voxels.shape == scan().voxels.shape
+
+
+def test_a_reader_that_waits_without_end_is_stopped(tmp_path, python):
+    """The reader's time counts from the begin of reading, and it is stopped although it uses no processor."""
+    wait = (
+        "import sys, time, pathlib; from vstent.io import child; "
+        "child.READERS['scan'] = lambda *_: time.sleep(100); "
+        "child.main('scan', pathlib.Path('a.nrrd'), {}, pathlib.Path(sys.argv[1]), {'memory': 4e9, 'seconds': 0.1})"
+    )
+    python(f'exec {sys.executable} -c "{wait}" "$6"')
+    with pytest.raises(ReadError, match=r"a\.nrrd is damaged"):
         read_image(tmp_path / "a.nrrd")
 
 
