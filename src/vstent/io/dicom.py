@@ -6,9 +6,10 @@ import struct
 import warnings
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -58,8 +59,8 @@ class _Slice:
     """Factor from stored to rescaled values."""
     intercept: float
     """Offset added after the factor."""
-    padding: tuple[int, int] | None
-    """Smallest and largest stored value that mark pixels outside the field of view; None where not stated."""
+    padding: list[int]
+    """Smallest and largest stored value that mark pixels outside the field of view; none where not stated."""
     thickness_mm: float
     """Thickness; 0 where not stated."""
     rounding_mm: float
@@ -74,6 +75,16 @@ class _Slice:
     def size(self) -> tuple[int, int]:
         """Number of rows and of columns."""
         return int(self.dataset.Rows), int(self.dataset.Columns)
+
+    @property
+    def is_inverted(self) -> bool:
+        """Whether low values are bright (MONOCHROME1)."""
+        return str(getattr(self.dataset, "PhotometricInterpretation", "")).strip() == "MONOCHROME1"
+
+    @cached_property
+    def place(self) -> tuple[int, ...]:
+        """Position as whole multiples of `SAME_PLACE_MM`."""
+        return tuple(np.round(self.position_mm / SAME_PLACE_MM).astype(int).tolist())
 
 
 BARE: Final = re.compile(rb"[\x02\x08]\0.\0([A-Z]{2}|.{2}\0\0)|\0[\x02\x08]\0.[A-Z]{2}", re.DOTALL)
@@ -105,18 +116,7 @@ def is_directory(path: Path) -> bool:
 
 
 def load(path: Path, *, with_pixels: bool = False) -> Any:
-    """Return the data set of a DICOM file, also where it has no preamble or no file meta information.
-
-    Parameters
-    ----------
-    path : the file.
-    with_pixels : whether the pixel data are read.
-
-    Raises
-    ------
-    Exception
-        One of `damage`.
-    """
+    """Return the data set of a DICOM file, also where it has no preamble or meta information; it may raise `damage`."""
     import pydicom
 
     dataset = pydicom.dcmread(path, stop_before_pixels=not with_pixels, force=True)
@@ -137,13 +137,6 @@ def read_dicom(path: Path, *, has_spacing: bool = False, acquisition: int | None
     Files that are no slices of a volume are passed over. Slices are ordered by position, never by name or number. Exact
     copies of a slice are dropped. Where a series holds several acquisitions of the same slices, such as mask and fill
     runs, one is read: the requested one, else the one with the brightest vessels. MONOCHROME1 images are inverted.
-
-    Raises
-    ------
-    ReadError
-        There is no DICOM volume, or a slice is missing, duplicated with other pixels, or misplaced.
-    UnitError
-        The pixel spacing is not stated.
     """
     with quiet():
         series, notes = _choose(path.parent if is_directory(path) else path)
@@ -154,13 +147,10 @@ def read_dicom(path: Path, *, has_spacing: bool = False, acquisition: int | None
         slices, affine, of_places = _arrange(planes)
         voxels = np.stack([_pixels(plane) for plane in slices], axis=-1)  # (row, column, slice)
         modality = str(getattr(slices[0].dataset, "Modality", ""))
-        of_colors = (INVERTED,) if _is_inverted(slices[0]) else ()
-    notes = (*notes, *of_groups, *of_copies, *of_places, *of_colors)
+    notes = (*notes, *of_groups, *of_copies, *of_places)
+    if slices[0].is_inverted:
+        notes = (*notes, "The images are MONOCHROME1 (bright means low): intensities were inverted.")
     return Image(voxels.transpose(1, 0, 2), affine, modality, notes)
-
-
-INVERTED: Final = "The images are MONOCHROME1 (bright means low): intensities were inverted."
-"""Note on inverted images."""
 
 
 def series_of(path: Path) -> list[Path]:
@@ -179,8 +169,7 @@ def quiet() -> Iterator[None]:
     level = logger.level
     logger.setLevel(logging.CRITICAL)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             yield
     finally:
         logger.setLevel(level)
@@ -210,15 +199,14 @@ class _Series(NamedTuple):
     @property
     def n_slices(self) -> int:
         """Number of slices."""
-        return sum(int(getattr(dataset, "NumberOfFrames", 1) or 1) for _, dataset in self.files)
+        return sum(_n_frames(dataset) for _, dataset in self.files)
 
     @property
     def rank(self) -> tuple[bool, bool, bool, bool, int]:
         """Suitability; the largest is read."""
-        kind = _text(getattr(self.header, "ImageType", None)).upper()
-        is_original = kind.startswith(("ORIGINAL", "NONE"))
-        n_voxels = sum(_n_voxels(dataset) for _, dataset in self.files)
+        is_original = _text(getattr(self.header, "ImageType", None)).upper().startswith(("ORIGINAL", "NONE"))
         is_plain = not _is_reformat(self.header) and not self.is_thick
+        n_voxels = sum(_n_voxels(dataset) for _, dataset in self.files)
         return not self.flaw, self.n_slices >= FEWEST_SLICES, is_plain, is_original, n_voxels
 
     @property
@@ -257,63 +245,53 @@ def _flaw(dataset: Any) -> str:
         return "segmentation"
     if int(getattr(dataset, "SamplesPerPixel", 1) or 1) > 1:
         return "colors"
-    n_frames = int(getattr(dataset, "NumberOfFrames", 1) or 1)
     frames = getattr(dataset, "PerFrameFunctionalGroupsSequence", None)
-    if n_frames > 1 and not frames:
+    if _n_frames(dataset) > 1 and not frames:
         return "projections"
     places = [dataset, *([frames[0]] if frames else []), *getattr(dataset, "SharedFunctionalGroupsSequence", [])]
     is_placed = all(_value(places, name) is not None for name in ("ImagePositionPatient", "ImageOrientationPatient"))
     return "" if is_placed else "no position in the patient"
 
 
+FLAWS: Final = {
+    "segmentation": "is a DICOM segmentation, which vstent does not read. Export it as NIfTI or NRRD.",
+    "colors": "is an image in colors, not a slice of a scan. Export the 3-D reconstruction.",
+    "projections": "is a series of projections, not a volume. Export the 3-D reconstruction.",
+}
+"""What is said of images that are no slices of a volume."""
+
+
 def _choose(path: Path) -> tuple[list[tuple[Path, Any]], tuple[str, ...]]:
     """Return the files of one series (that of the file given, or the most suitable one) and notes."""
+    found: dict[tuple[str, bool, bool], list[tuple[Path, Any]]] = {}
     try:
-        return _chosen(path)
+        for file, dataset in _headers(path):
+            if dataset is not None:
+                # A series may hold scouts, projections and captures of the screen beside its slices.
+                key = str(getattr(dataset, "SeriesInstanceUID", "")), _is_reformat(dataset), _flaw(dataset) == "colors"
+                found.setdefault(key, []).append((file, dataset))
+        every = []
+        for files in found.values():
+            flaws = {_flaw(dataset) for _, dataset in files}
+            every.append(_Series(files, "" if "" in flaws else min(flaws)))
+        wanted = [series for series in every if path.is_dir() or any(file == path for file, _ in series.files)]
+        if not wanted:
+            raise ReadError(f"{path} holds no DICOM images. Check the path, or export the series again.")
+        chosen = max(wanted, key=lambda series: series.rank)
+        if chosen.flaw in FLAWS:
+            raise ReadError(f"{chosen.files[0][0].name} {FLAWS[chosen.flaw]}")
+        n_bytes = sum(
+            _n_voxels(image) * int(getattr(image, "BitsAllocated", 16) or 16) // 8 for _, image in chosen.files
+        )
+        n_held = sum(file.stat().st_size for file, _ in chosen.files)
+        refuse_bomb(f"{path} states {counted(chosen.n_slices, 'slice')}", n_bytes, n_held)
+        others = "; ".join(str(series) for series in every if series is not chosen)
+        note = (
+            f"{len(every)} DICOM series found. Series {chosen} is used; others: {others}. To use another one, give one "
+        )
+        return chosen.files, (f"{note}of its files.",) if others and path.is_dir() else ()
     except damage():  # pydicom raises faults of a header when its values are used
         raise ReadError(f"{path} holds a DICOM file with a damaged header. Copy it again, or remove it.") from None
-
-
-def _chosen(path: Path) -> tuple[list[tuple[Path, Any]], tuple[str, ...]]:
-    """Return what `_choose` does; faults of headers are raised as they are."""
-    found: dict[tuple[str, bool, bool], list[tuple[Path, Any]]] = {}
-    for file, dataset in _headers(path):
-        if dataset is not None:
-            # A series may hold scouts, projections and captures of the screen beside its slices.
-            key = str(getattr(dataset, "SeriesInstanceUID", "")), _is_reformat(dataset), _flaw(dataset) == "colors"
-            found.setdefault(key, []).append((file, dataset))
-    flaws = {key: {_flaw(dataset) for _, dataset in files} for key, files in found.items()}
-    every = [_Series(files, "" if "" in flaws[key] else min(flaws[key])) for key, files in found.items()]
-    wanted = [one for one in every if path.is_dir() or any(file == path for file, _ in one.files)]
-    if not wanted:
-        raise ReadError(f"{path} holds no DICOM images. Check the path, or export the series again.")
-    chosen = max(wanted, key=lambda one: one.rank)
-    _refuse_flaw(chosen)
-    n_bytes = sum(_n_voxels(one) * int(getattr(one, "BitsAllocated", 16) or 16) // 8 for _, one in chosen.files)
-    refuse_bomb(f"{path} states {counted(chosen.n_slices, 'slice')}", n_bytes, _size(file for file, _ in chosen.files))
-    if len(every) < 2 or not path.is_dir():
-        return chosen.files, ()
-    others = "; ".join(str(one) for one in every if one is not chosen)
-    return chosen.files, (
-        f"{len(every)} DICOM series found. Series {chosen} is used; others: {others}. To use another one, give one of "
-        "its files.",
-    )
-
-
-def _refuse_flaw(series: _Series) -> None:
-    """Raise ReadError where the best series is no volume."""
-    name = series.files[0][0].name
-    if series.flaw == "segmentation":
-        raise ReadError(f"{name} is a DICOM segmentation, which vstent does not read. Export it as NIfTI or NRRD.")
-    if series.flaw == "colors":
-        raise ReadError(f"{name} is an image in colors, not a slice of a scan. Export the 3-D reconstruction.")
-    if series.flaw == "projections":
-        raise ReadError(f"{name} is a series of projections, not a volume. Export the 3-D reconstruction.")
-
-
-def _size(files: Iterable[Path]) -> int:
-    """Return the size of files in bytes."""
-    return sum(file.stat().st_size for file in files)
 
 
 def _headers(path: Path) -> Iterator[tuple[Path, Any]]:
@@ -327,20 +305,17 @@ def _headers(path: Path) -> Iterator[tuple[Path, Any]]:
         return
     own = _header(path)
     yield path, own
-    if own is not None and int(getattr(own, "NumberOfFrames", 1) or 1) > 1:
-        return
-    for file in _siblings(path):
-        with suppress(ReadError):
-            yield file, _header(file)
+    if own is None or _n_frames(own) < 2:
+        for file in sorted(path.parent.iterdir()):
+            with suppress(ReadError):
+                if file != path and is_dicom(file):
+                    yield file, _header(file)
 
 
 def candidates(path: Path) -> list[Path]:
     """Return the DICOM files below a folder, or below that of a DICOMDIR, without folders of results.
 
-    Raises
-    ------
-    ReadError
-        A file has the suffix of DICOM but not its content: its slice would be missing.
+    ReadError is raised where a file has the suffix of DICOM but not its content: its slice would be missing.
     """
     found = []
     for file in files_in(path if path.is_dir() else path.parent):
@@ -351,11 +326,6 @@ def candidates(path: Path) -> list[Path]:
                 f"{file.name} is not a DICOM file, or its beginning is damaged. Copy it again, or remove it."
             )
     return found
-
-
-def _siblings(path: Path) -> list[Path]:
-    """Return the other DICOM files in the folder of a file."""
-    return sorted(p for p in path.parent.iterdir() if p != path and is_dicom(p))
 
 
 def _header(file: Path) -> Any:
@@ -394,31 +364,30 @@ def _refuse_bomb(file: Path) -> None:
         raise ReadError(f"{file.name} unpacks to more than {MOST_UNPACKED / 1e9:.1f} GB. Export the series again.")
 
 
+def _n_frames(dataset: Any) -> int:
+    """Return the number of frames of a file."""
+    return int(getattr(dataset, "NumberOfFrames", 1) or 1)
+
+
 def _n_voxels(dataset: Any) -> int:
     """Return the number of voxels of a file."""
-    return int(dataset.Rows) * int(dataset.Columns) * int(getattr(dataset, "NumberOfFrames", 1) or 1)
+    return int(dataset.Rows) * int(dataset.Columns) * _n_frames(dataset)
 
 
 def _planes(file: Path, dataset: Any, *, has_spacing: bool) -> list[_Slice]:
     """Return the slices of one file: itself, or its frames."""
     try:
-        return _frames(file, dataset, has_spacing=has_spacing)
+        if "PerFrameFunctionalGroupsSequence" in dataset:
+            shared = list(getattr(dataset, "SharedFunctionalGroupsSequence", []))
+            places = [[frame, *shared, dataset] for frame in dataset.PerFrameFunctionalGroupsSequence]
+            return [_plane(file, dataset, k, place, has_spacing=has_spacing) for k, place in enumerate(places)]
+        if _n_frames(dataset) > 1:
+            raise ReadError(f"{file.name} {FLAWS['projections']}")
+        return [_plane(file, dataset, None, [dataset], has_spacing=has_spacing)]
     except damage():
         raise ReadError(
             f"{file.name} is damaged: its position, orientation or pixel spacing cannot be read. Export it again."
         ) from None
-
-
-def _frames(file: Path, dataset: Any, *, has_spacing: bool) -> list[_Slice]:
-    """Return the slices of one file; ReadError is raised for a series of projections."""
-    if "PerFrameFunctionalGroupsSequence" not in dataset:
-        if int(getattr(dataset, "NumberOfFrames", 1) or 1) > 1:
-            raise ReadError(f"{file.name} is a series of projections, not a volume. Export the 3-D reconstruction.")
-        return [_plane(file, dataset, None, [dataset], has_spacing=has_spacing)]
-    shared = list(getattr(dataset, "SharedFunctionalGroupsSequence", []))
-    frames = dataset.PerFrameFunctionalGroupsSequence
-    places = [[frame, *shared, dataset] for frame in frames]
-    return [_plane(file, dataset, k, place, has_spacing=has_spacing) for k, place in enumerate(places)]
 
 
 _GROUP: Final = {
@@ -453,6 +422,10 @@ def _plane(file: Path, dataset: Any, frame: int | None, places: list[Any], *, ha
         )
     if pixel is None and not has_spacing:
         raise UnitError(f"Slice {name} does not state its pixel spacing; give --spacing in mm.")
+    padding = getattr(dataset, "PixelPaddingValue", None)
+    ends = () if padding is None else (int(padding), int(getattr(dataset, "PixelPaddingRangeLimit", padding)))
+    words = [str(getattr(value, "original_string", value)).strip() for value in position]
+    rounding_mm = min(10.0 ** -len(word.partition(".")[2]) if "e" not in word.lower() else 0.0 for word in words)
     return _Slice(
         dataset,
         file,
@@ -462,25 +435,10 @@ def _plane(file: Path, dataset: Any, frame: int | None, places: list[Any], *, ha
         np.asarray([1.0, 1.0] if pixel is None else pixel, dtype=np.float64).reshape(2)[::-1],
         float(_value(places, "RescaleSlope") or 1.0),
         float(_value(places, "RescaleIntercept") or 0.0),
-        _padding(dataset),
+        sorted(ends),
         float(_value(places, "SliceThickness") or 0.0),
-        _rounding_mm(position),
+        float(rounding_mm),
     )
-
-
-def _rounding_mm(position: Any) -> float:
-    """Return the last digit to which a position is written, in mm."""
-    words = [str(getattr(value, "original_string", value)).strip() for value in position]
-    return float(min(10.0 ** -len(word.partition(".")[2]) if "e" not in word.lower() else 0.0 for word in words))
-
-
-def _padding(dataset: Any) -> tuple[int, int] | None:
-    """Return the range of stored values outside the field of view; None where it is not stated."""
-    value = getattr(dataset, "PixelPaddingValue", None)
-    if value is None:
-        return None
-    ends = int(value), int(getattr(dataset, "PixelPaddingRangeLimit", value))
-    return min(ends), max(ends)
 
 
 # -- acquisitions and copies ----------------------------------------------------------------------------------------
@@ -504,11 +462,6 @@ SLICES_LOOKED_AT: Final = 5
 """Number of slices of an acquisition whose brightness is averaged."""
 
 
-def _places(planes: list[_Slice]) -> list[tuple[int, ...]]:
-    """Return the position of every slice as whole multiples of `SAME_PLACE_MM`."""
-    return [tuple(np.round(plane.position_mm / SAME_PLACE_MM).astype(int).tolist()) for plane in planes]
-
-
 def _one_acquisition(planes: list[_Slice], wanted: int | None) -> tuple[list[_Slice], tuple[str, ...]]:
     """Return the slices of one acquisition and a note, where a series holds several of the same slices."""
     key, groups = _acquisitions(planes)
@@ -516,18 +469,20 @@ def _one_acquisition(planes: list[_Slice], wanted: int | None) -> tuple[list[_Sl
         if wanted not in (None, 1):
             raise ReadError(f"The series holds one acquisition: acquisition {wanted} does not exist. Give 1 or none.")
         return planes, ()
-    names = [
-        f"{number}: {ACQUISITION_KEYS[key]} {name}, {len(one)} slices" for number, (name, one) in enumerate(groups, 1)
-    ]
-    listed = "; ".join(names)
+    listed = "; ".join(
+        f"{number}: {ACQUISITION_KEYS[key]} {name}, {len(group)} slices"
+        for number, (name, group) in enumerate(groups, 1)
+    )
     if wanted is not None and not 1 <= wanted <= len(groups):
         raise ReadError(
             f"The series holds {len(groups)} acquisitions ({listed}), not {wanted}. Give one of these numbers."
         )
-    chosen = int(np.argmax([_brightness(one) for _, one in groups])) if wanted is None else wanted - 1
-    why = "chosen because its vessels are the brightest; choose another by its number (--acquisition)"
-    note = f"The series holds {len(groups)} acquisitions ({listed}). Acquisition {chosen + 1} is used"
-    return groups[chosen][1], (f"{note}, as requested." if wanted is not None else f"{note}, {why}.",)
+    chosen = int(np.argmax([_brightness(group) for _, group in groups])) if wanted is None else wanted - 1
+    why = ", as requested"
+    if wanted is None:
+        why = ", chosen because its vessels are the brightest; choose another by its number (--acquisition)"
+    note = f"The series holds {len(groups)} acquisitions ({listed}). Acquisition {chosen + 1} is used{why}."
+    return groups[chosen][1], (note,)
 
 
 def _acquisitions(planes: list[_Slice]) -> tuple[str, list[tuple[str, list[_Slice]]]]:
@@ -535,14 +490,15 @@ def _acquisitions(planes: list[_Slice]) -> tuple[str, list[tuple[str, list[_Slic
 
     It is the first attribute that divides slices of the same position so that every group has each position once.
     """
-    if len(set(_places(planes))) == len(planes):
+    if len({plane.place for plane in planes}) == len(planes):
         return "", []
     for key in ACQUISITION_KEYS:
         groups: dict[str, list[_Slice]] = {}
         for plane in planes:
             groups.setdefault(_text(getattr(plane.dataset, key, None)), []).append(plane)
-        shared = set.intersection(*(set(_places(one)) for one in groups.values()))
-        if len(groups) > 1 and shared and all(len(set(_places(one))) == len(one) for one in groups.values()):
+        places = [{plane.place for plane in group} for group in groups.values()]
+        is_divided = all(len(own) == len(group) for own, group in zip(places, groups.values(), strict=True))
+        if len(groups) > 1 and is_divided and set.intersection(*places):
             return key, sorted(groups.items(), key=lambda item: _sortable(item[0]))
     return "", []
 
@@ -572,19 +528,17 @@ def _brightness(planes: list[_Slice]) -> float:
 
 def _without_copies(planes: list[_Slice]) -> tuple[list[_Slice], tuple[str, ...]]:
     """Return slices without exact copies (same position, same pixels), and a note where there are any."""
-    kept: dict[tuple[int, ...], _Slice] = {}
+    unique: dict[tuple[int, ...], _Slice] = {}
     others: list[_Slice] = []
     dropped = 0
-    for place, plane in zip(_places(planes), planes, strict=True):
-        first = kept.setdefault(place, plane)
-        if first is plane:
-            continue
-        if np.array_equal(_pixels(first), _pixels(plane)):
+    for plane in planes:
+        first = unique.setdefault(plane.place, plane)
+        if first is not plane and np.array_equal(_pixels(first), _pixels(plane)):
             dropped += 1
-        else:
+        elif first is not plane:
             others.append(plane)
     note = f"{counted(dropped, 'slice')} with the same position and the same pixels as another: dropped."
-    return [*kept.values(), *others], (note,) if dropped else ()
+    return [*unique.values(), *others], (note,) if dropped else ()
 
 
 # -- geometry ----------------------------------------------------------------------------------------------------------
@@ -604,10 +558,14 @@ def _arrange(slices: list[_Slice]) -> tuple[list[_Slice], Floats, tuple[str, ...
     position = np.array([plane.position_mm for plane in slices])
     step = (position[-1] - position[0]) / (len(slices) - 1)
     step_mm, rounding_mm = float(np.linalg.norm(step)), min(plane.rounding_mm for plane in slices)
-    notes = _overlap_note(slices[0], step_mm)
+    notes: tuple[str, ...] = ()
+    if slices[0].thickness_mm > MOST_OVERLAP * step_mm:
+        notes = (
+            f"The slices are {slices[0].thickness_mm:.3g} mm thick and {step_mm:.3g} mm apart: they are averages or "
+            "projections, in which vessels and sac are wider. Use the original series.",
+        )
     try:
-        _refuse_gaps(slices, height[order])
-        _refuse_offsets(slices, position - position[0] - np.arange(len(slices))[:, None] * step, step_mm)
+        _refuse_uneven(slices, height[order], position - position[0] - np.arange(len(slices))[:, None] * step, step_mm)
     except ReadError:
         if not _fits_rounded(position, rounding_mm):
             raise
@@ -630,16 +588,6 @@ def _fits_rounded(position_mm: Floats, rounding_mm: float) -> bool:
     # The deviation of a missing slice is at least a quarter of the slice distance.
     most_mm = min(ROUNDED * rounding_mm + SPACING_TOLERANCE * step_mm, 0.24 * step_mm)
     return bool(np.abs(position_mm - design @ line).max() <= most_mm)
-
-
-def _overlap_note(plane: _Slice, step_mm: float) -> tuple[str, ...]:
-    """Return a note on slices that are much thicker than the distance between them."""
-    if plane.thickness_mm <= MOST_OVERLAP * step_mm:
-        return ()
-    return (
-        f"The slices are {plane.thickness_mm:.3g} mm thick and {step_mm:.3g} mm apart: they are averages or "
-        "projections, in which vessels and sac are wider. Use the original series.",
-    )
 
 
 def _common_directions(slices: list[_Slice]) -> Floats:
@@ -675,8 +623,8 @@ def _common_directions(slices: list[_Slice]) -> Floats:
     return np.stack([across, down])
 
 
-def _refuse_gaps(slices: list[_Slice], height: Floats) -> None:
-    """Raise ReadError where slices are missing, at the same position, or unevenly spaced."""
+def _refuse_uneven(slices: list[_Slice], height: Floats, offset_mm: Floats, step_mm: float) -> None:
+    """Raise ReadError where slices are missing, at the same position, unevenly spaced, or out of line."""
     steps = np.diff(height)
     usual = float(np.median(steps))
     for i, step in enumerate(steps):
@@ -697,10 +645,6 @@ def _refuse_gaps(slices: list[_Slice], height: Floats) -> None:
                 f"Slice {slices[i + 1].name} is {step:.3f} mm from {slices[i].name}, but slices are {usual:.3f} mm "
                 "apart elsewhere. Export the series with equal distances."
             )
-
-
-def _refuse_offsets(slices: list[_Slice], offset_mm: Floats, step_mm: float) -> None:
-    """Raise ReadError where a slice is off the line of the others."""
     distance = np.linalg.norm(offset_mm, axis=1)
     worst = int(distance.argmax())
     if distance[worst] > max(SPACING_TOLERANCE * step_mm, 1e-3):
@@ -714,15 +658,22 @@ def _refuse_offsets(slices: list[_Slice], offset_mm: Floats, step_mm: float) -> 
 
 def _pixels(plane: _Slice) -> NDArray[Any]:
     """Return the rescaled values (rows, columns) of one slice; high values are bright."""
-    pixels = _decoded(plane)
+    pixels = _stored(plane)
     if pixels.shape != plane.size:
         raise ReadError(
             f"Slice {plane.name} holds {pixels.shape} values where its header states {plane.size}. Export it again."
         )
     if plane.padding:
-        pixels = _without_padding(pixels, plane.padding, is_inverted=_is_inverted(plane))
-    if _is_inverted(plane):
-        pixels = _inverted(pixels, plane.dataset)
+        # The padding value may be brighter than any contrast (DICOM PS3.3, C.7.5.1.1.2).
+        is_padding = (pixels >= plane.padding[0]) & (pixels <= plane.padding[1])
+        inside = pixels[~is_padding] if not is_padding.all() else np.zeros(1, pixels.dtype)
+        pixels = np.where(is_padding, inside.max() if plane.is_inverted else inside.min(), pixels)
+    if plane.is_inverted and pixels.dtype.kind == "f":
+        pixels = -pixels
+    elif plane.is_inverted:
+        is_signed, bits = int(getattr(plane.dataset, "PixelRepresentation", 0)), int(plane.dataset.BitsStored)
+        top = -1 if is_signed else (1 << bits) - 1
+        pixels = (top - pixels.astype(np.int64)).astype(np.int32 if bits > 15 else pixels.dtype)
     if plane.slope == 1.0 and plane.intercept == 0.0:
         return pixels
     if plane.slope.is_integer() and plane.intercept.is_integer() and pixels.dtype.kind in "iu":
@@ -730,54 +681,23 @@ def _pixels(plane: _Slice) -> NDArray[Any]:
     return (pixels * plane.slope + plane.intercept).astype(np.float32)
 
 
-def _without_padding(stored: NDArray[Any], padding: tuple[int, int], *, is_inverted: bool) -> NDArray[Any]:
-    """Return stored values (rows, columns) with pixels outside the field of view set to the darkest value inside, or 0.
-
-    The padding value may be brighter than any contrast (DICOM PS3.3, C.7.5.1.1.2).
-    """
-    is_padding = (stored >= padding[0]) & (stored <= padding[1])
-    rest = stored[~is_padding]
-    if not rest.size:
-        return np.where(is_padding, stored.dtype.type(0), stored)
-    return np.where(is_padding, rest.max() if is_inverted else rest.min(), stored)
-
-
-def _is_inverted(plane: _Slice) -> bool:
-    """Return whether low values of a slice are bright (MONOCHROME1)."""
-    return str(getattr(plane.dataset, "PhotometricInterpretation", "")).strip() == "MONOCHROME1"
-
-
-def _inverted(stored: NDArray[Any], dataset: Any) -> NDArray[Any]:
-    """Return the stored values of a MONOCHROME1 image inverted within their number of bits."""
-    if stored.dtype.kind == "f":
-        return -stored
-    is_signed, bits = int(getattr(dataset, "PixelRepresentation", 0)), int(dataset.BitsStored)
-    top = -1 if is_signed else (1 << bits) - 1
-    return (top - stored.astype(np.int64)).astype(np.int32 if bits > 15 else stored.dtype)
-
-
-def _decoded(plane: _Slice) -> NDArray[Any]:
-    """Return the stored values (rows, columns) of one slice."""
-    try:
-        if not any(keyword in plane.dataset for keyword in PIXELS):
-            _load_pixels(plane)
-        array = plane.dataset.pixel_array
-    except damage():
-        array = _decoded_by_gdcm(plane)
-    return array if plane.frame is None or array.ndim == 2 else array[plane.frame]
-
-
 PIXELS: Final = ("PixelData", "FloatPixelData", "DoubleFloatPixelData")
 """Elements that hold pixels."""
 
 
-def _load_pixels(plane: _Slice) -> None:
-    """Add the pixel data to the header of a slice."""
-    full = load(plane.path, with_pixels=True)
-    for keyword in PIXELS:
-        if keyword in full:
-            plane.dataset[keyword] = full[keyword]
-    plane.dataset.file_meta = full.file_meta
+def _stored(plane: _Slice) -> NDArray[Any]:
+    """Return the stored values (rows, columns) of one slice."""
+    try:
+        if not any(keyword in plane.dataset for keyword in PIXELS):
+            full = load(plane.path, with_pixels=True)
+            for keyword in PIXELS:
+                if keyword in full:
+                    plane.dataset[keyword] = full[keyword]
+            plane.dataset.file_meta = full.file_meta
+        array = plane.dataset.pixel_array
+    except damage():
+        array = _decoded_by_gdcm(plane)
+    return array if plane.frame is None or array.ndim == 2 else array[plane.frame]
 
 
 def _decoded_by_gdcm(plane: _Slice) -> NDArray[Any]:
