@@ -25,56 +25,39 @@ RENAMED: Final = ("SeriesInstanceUID", "SOPInstanceUID")
 def strip_dicom(path: Path, out: Path) -> None:
     """Write a copy of a DICOM file with only the elements needed to read its voxels; none of a DICOMDIR.
 
-    Parameters
-    ----------
-    path : the file.
-    out : the copy to write.
-
-    Raises
-    ------
-    ReadError
-        The file is damaged.
+    ReadError is raised where the file is damaged.
     """
-    import pydicom
+    from pydicom.dataset import FileMetaDataset
+    from pydicom.uid import generate_uid
 
     if is_directory(path):
         return
     try:
         with quiet():
             given = load(path, with_pixels=True)
-            kept = _kept(given)
+            stripped = _stripped(given)
             for name in RENAMED:
                 if name in given:
-                    setattr(kept, name, pydicom.uid.generate_uid(entropy_srcs=[str(given[name].value)]))
-            kept.file_meta = _meta(given, kept)
+                    setattr(stripped, name, generate_uid(entropy_srcs=[str(given[name].value)]))
+            stripped.file_meta = FileMetaDataset()
+            stripped.file_meta.TransferSyntaxUID = given.file_meta.TransferSyntaxUID
+            stripped.file_meta.MediaStorageSOPClassUID = stripped.SOPClassUID
+            stripped.file_meta.MediaStorageSOPInstanceUID = stripped.SOPInstanceUID
             with atomic(out) as partial:
-                kept.save_as(partial, enforce_file_format=True)
+                stripped.save_as(partial, enforce_file_format=True)
     except damage():
         raise ReadError(f"{out.name} is damaged, or not a DICOM image. Copy it again from its source.") from None
 
 
-def _kept(given: Any) -> Any:
-    """Return the elements of a data set that are kept, also in sequences."""
+def _stripped(given: Any) -> Any:
+    """Return a data set with the elements that are kept, also in sequences."""
     from pydicom.dataset import Dataset
     from pydicom.sequence import Sequence
 
-    kept = Dataset()
+    stripped = Dataset()
     for element in given:
-        if element.keyword not in KEPT:
-            continue
-        if element.VR == "SQ":
-            element.value = Sequence([_kept(item) for item in element.value])
-        kept.add(element)
-    return kept
-
-
-def _meta(given: Any, kept: Any) -> Any:
-    """Return the file meta information of a stripped file."""
-    from pydicom.dataset import FileMetaDataset
-    from pydicom.uid import ImplicitVRLittleEndian
-
-    meta = FileMetaDataset()
-    meta.TransferSyntaxUID = getattr(given.file_meta, "TransferSyntaxUID", ImplicitVRLittleEndian)
-    meta.MediaStorageSOPClassUID = kept.SOPClassUID
-    meta.MediaStorageSOPInstanceUID = kept.SOPInstanceUID
-    return meta
+        if element.keyword in KEPT:
+            if element.VR == "SQ":
+                element.value = Sequence([_stripped(item) for item in element.value])
+            stripped.add(element)
+    return stripped

@@ -4,7 +4,10 @@ import gzip
 import os
 import re
 import secrets
+import shutil
+import tempfile
 import threading
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedIOBase
@@ -27,6 +30,8 @@ _VTK_IMAGE: Final = re.compile(rb"^\s*DATASET\s+(STRUCTURED_POINTS|RECTILINEAR_G
 """Line of a legacy VTK file that holds an image."""
 PARTIAL: Final = ".partial-"
 """Prefix of the name of a file that is being written; the process number follows."""
+DAMAGE: Final = (OSError, EOFError, zlib.error)
+"""Exceptions that reading a damaged gzip file raises."""
 _ONE_AT_A_TIME: Final = threading.RLock()
 """Lock of `silenced`."""
 
@@ -53,11 +58,8 @@ def suffix(path: Path) -> str:
 def existing(path: Path) -> Path:
     """Return the path of a file or folder that exists.
 
-    Raises
-    ------
-    ReadError
-        The path does not exist, its name is not text, or it is something else, such as a named pipe, on which reading
-        would wait forever.
+    ReadError is raised where it does not, where its name is not text, and for something else, such as a named pipe, on
+    which reading would wait forever.
     """
     path = Path(path)
     if not path.exists():
@@ -103,25 +105,32 @@ def atomic(path: Path) -> Iterator[Path]:
             os.unlink(name)
 
 
+@contextmanager
+def atomic_folder(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder that replaces `folder` on success and is removed on failure."""
+    folder = Path(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    try:
+        yield building
+        building.chmod(0o755)
+        shutil.rmtree(folder, ignore_errors=True)
+        building.replace(folder)
+    finally:
+        shutil.rmtree(building, ignore_errors=True)
+
+
 def sweep(folder: Path) -> None:
     """Remove half-written files of killed processes from a folder and four levels below it."""
     for depth in range(5):
         for partial in folder.glob(f"{'*/' * depth}{PARTIAL}*"):
-            if partial.is_file() and not _is_running(partial.name[len(PARTIAL) :].partition("-")[0]):
-                partial.unlink(missing_ok=True)
-
-
-def _is_running(process: str) -> bool:
-    """Return whether the process with this number is running."""
-    if not process.isdigit():
-        return False
-    try:
-        os.kill(int(process), 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True
-    return True
+            try:
+                os.kill(int(partial.name[len(PARTIAL) :].partition("-")[0]), 0)
+            except (ProcessLookupError, ValueError):
+                if partial.is_file():
+                    partial.unlink(missing_ok=True)
+            except OSError:
+                continue  # the process is running, for another user
 
 
 @contextmanager

@@ -14,6 +14,16 @@ MOST_FOLDS: Final = 200
 """Largest ratio to which a larger scan may be packed; noise keeps that of a scan below 10."""
 
 
+def refuse_torn(announced: str, n_bytes: int, n_held: int) -> None:
+    """Raise ReadError for voxels of more bytes than a file can hold, or of too many."""
+    if n_bytes > MOST_PACKED * n_held:
+        raise ReadError(
+            f"{announced}, {n_bytes / 1e9:.3g} GB, but has {n_held} bytes: it is damaged and breaks off. Copy or "
+            "export it again."
+        )
+    refuse_bomb(announced, n_bytes, n_held)
+
+
 def refuse_bomb(name: str, n_bytes: int, n_held: int) -> None:
     """Raise ReadError for voxels of too many bytes, or of too many for the size of the file."""
     if n_bytes > MOST_BYTES:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vstent.errors import ReadError
-from vstent.io.dicom_header import put_instance, research_header
+from vstent.io.dicom_writer import put_instance, research_header
 from vstent.io.files import atomic, existing
 from vstent.kernels.arrays import Floats
 
@@ -55,48 +55,29 @@ class XaHeader:
 def study_of(path: Path) -> dict[str, Any]:
     """Return the fields of patient and study of a DICOM file, for a film that is to lie beside it.
 
-    Raises
-    ------
-    ReadError
-        The file does not exist or is not DICOM.
+    ReadError is raised where the file does not exist or is not DICOM.
     """
     from pydicom import dcmread
     from pydicom.errors import InvalidDicomError
 
     try:
-        found = dcmread(existing(path), stop_before_pixels=True, specific_tags=list(STUDY_FIELDS))
+        header = dcmread(existing(path), stop_before_pixels=True, specific_tags=list(STUDY_FIELDS))
     except InvalidDicomError:
         raise ReadError(f"{path} is not a DICOM file. Give one file of the examination.") from None
-    return {name: found.get(name) for name in STUDY_FIELDS if found.get(name) is not None}
+    return {name: header.get(name) for name in STUDY_FIELDS if header.get(name) is not None}
 
 
 def write_xa(path: Path, pixels: NDArray[np.uint16], header: XaHeader) -> None:
     """Write a film as one XA multi-frame file; equal films give equal bytes.
 
-    The image is marked as derived and for research. It names no patient unless `XaHeader.study` does.
-
-    Parameters
-    ----------
-    path : the file.
-    pixels : (f, rows, columns) values from 0 to 4095, black to white.
-    header : geometry, times and descriptions.
-
-    Raises
-    ------
-    ValueError
-        A value needs more than 12 bits.
+    The image is marked as derived and for research. It names no patient unless `XaHeader.study` does. The pixels
+    (f, rows, columns) are from 0 to 4095, black to white; ValueError is raised for larger ones.
     """
+    from pydicom.tag import Tag
+
     if pixels.max(initial=0) >= 1 << BITS:
         raise ValueError(f"a film of {BITS} bits holds values below {1 << BITS}")
-    film = _dataset(hashlib.sha256(pixels.tobytes() + repr(header).encode()).hexdigest(), header)
-    _put_positioner(film, header)
-    _put_pixels(film, pixels, header.frame_time_s)
-    with atomic(path) as partial:
-        film.save_as(partial, enforce_file_format=True, overwrite=True)
-
-
-def _dataset(digest: str, header: XaHeader) -> Any:
-    """Return patient, study, series, equipment and common fields."""
+    digest = hashlib.sha256(pixels.tobytes() + repr(header).encode()).hexdigest()
     film = research_header(XA_IMAGE_STORAGE, digest)
     put_instance(film, digest, "instance")
     film.PatientName, film.PatientID = "Research^vstent", "RESEARCH"
@@ -114,14 +95,9 @@ def _dataset(digest: str, header: XaHeader) -> Any:
     film.ImageComments = "Computed from a flow simulation, for research only"
     film.BurnedInAnnotation, film.LossyImageCompression = "NO", "00"
     film.ContrastBolusAgent, film.ContrastBolusIngredient = "Computed contrast agent", "IODINE"
-    return film
-
-
-def _put_positioner(film: Any, header: XaHeader) -> None:
-    """Add the modules X-Ray Acquisition and XA Positioner; no radiation was used, so that exposure is empty."""
+    # Modules X-Ray Acquisition and XA Positioner; no radiation was used, so that exposure is empty.
     film.KVP = film.XRayTubeCurrent = film.ExposureTime = film.Exposure = None
-    film.RadiationSetting = "GR"
-    film.PositionerMotion = "STATIC"
+    film.RadiationSetting, film.PositionerMotion = "GR", "STATIC"
     film.PositionerPrimaryAngle = f"{np.degrees(header.primary_rad):.4f}"
     film.PositionerSecondaryAngle = f"{np.degrees(header.secondary_rad):.4f}"
     film.DistanceSourceToDetector = f"{header.source_detector_mm:.4f}"
@@ -129,26 +105,22 @@ def _put_positioner(film: Any, header: XaHeader) -> None:
     film.EstimatedRadiographicMagnificationFactor = f"{header.source_detector_mm / header.source_isocenter_mm:.6f}"
     film.ImagerPixelSpacing = [f"{header.pixel_mm:.6f}"] * 2
     film.PatientOrientation = [_letters(header.axes[0]), _letters(-header.axes[1])]
-
-
-def _letters(direction: Floats) -> str:
-    """Return the letters of a direction in LPS, the largest component first; small ones are left out."""
-    names = ("LR", "PA", "HF")
-    order = [k for k in np.argsort(-np.abs(direction)) if abs(direction[k]) > 0.1]
-    return "".join(names[k][int(direction[k] < 0)] for k in order)
-
-
-def _put_pixels(film: Any, pixels: NDArray[np.uint16], frame_time_s: float) -> None:
-    """Add the modules Image Pixel, Multi-frame, Cine, X-Ray Image and VOI LUT."""
-    from pydicom.tag import Tag
-
+    # Modules Image Pixel, Multi-frame, Cine, X-Ray Image and VOI LUT.
     film.SamplesPerPixel, film.PhotometricInterpretation = 1, "MONOCHROME2"
     film.NumberOfFrames, film.Rows, film.Columns = pixels.shape
     film.BitsAllocated, film.BitsStored, film.HighBit, film.PixelRepresentation = 16, BITS, BITS - 1, 0
     film.PixelIntensityRelationship = "DISP"  # subtracted and ready for display; no Modality LUT belongs to it
     film.FrameIncrementPointer = Tag("FrameTime")
-    film.FrameTime = f"{1000.0 * frame_time_s:.6f}"
-    film.CineRate = film.RecommendedDisplayFrameRate = max(1, round(1.0 / frame_time_s))
+    film.FrameTime = f"{1000.0 * header.frame_time_s:.6f}"
+    film.CineRate = film.RecommendedDisplayFrameRate = max(1, round(1.0 / header.frame_time_s))
     film.PreferredPlaybackSequencing = 0
     film.WindowCenter, film.WindowWidth = str(1 << (BITS - 1)), str(1 << BITS)
     film.PixelData = np.ascontiguousarray(pixels, dtype="<u2").tobytes()
+    with atomic(path) as partial:
+        film.save_as(partial, enforce_file_format=True, overwrite=True)
+
+
+def _letters(direction: Floats) -> str:
+    """Return the letters of a direction in LPS, the largest component first; small ones are left out."""
+    order = [k for k in np.argsort(-np.abs(direction)) if abs(direction[k]) > 0.1]
+    return "".join(("LR", "PA", "HF")[k][int(direction[k] < 0)] for k in order)
