@@ -29,8 +29,7 @@ from vstent.cli import main
 from vstent.geometry.image import Image
 from vstent.geometry.surface import Surface
 from vstent.io.dicom_writer import write_dicom
-from vstent.io.polydata import polydata_of
-from vstent.io.writers import write_stl, write_surface
+from vstent.io.writers import polydata_of, write_stl, write_surface
 from vstent.study.folder import claimed
 
 INPUT, FAILED, DONE = 2, 1, 0

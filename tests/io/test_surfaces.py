@@ -8,10 +8,9 @@ from vstent.anatomy.repair import repair
 from vstent.devices.stent import tube_faces
 from vstent.errors import ReadError, UnitError
 from vstent.geometry.surface import Surface
-from vstent.io.polydata import polydata_of
 from vstent.io.surfaces import hydraulic_diameter, read_surface
 from vstent.io.vtk_reader import read_mesh
-from vstent.io.writers import write_stl, write_surface
+from vstent.io.writers import polydata_of, write_stl, write_surface
 
 
 def cylinder(radius=2.0, length=24.0, rows=13, columns=24):

@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedIOBase
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Final
 
 from vstent.errors import ReadError
@@ -69,6 +69,14 @@ def existing(path: Path) -> Path:
     if not (path.is_file() or path.is_dir()):
         raise ReadError(f"{path} is neither a file nor a folder. Give a scan or a surface.")
     return path
+
+
+def beside(path: Path, name: str, what: str = "file") -> Path:
+    """Return the path of a file that another one names; ReadError is raised where it is not beside that or below."""
+    # PureWindowsPath knows the separators and roots of all systems.
+    if PureWindowsPath(name).anchor or ".." in PureWindowsPath(name).parts:
+        raise ReadError(f"{path.name} names the {what} {name[:80]}. Only files beside it or below are read.")
+    return path.parent / name
 
 
 def files_in(folder: Path) -> list[Path]:

@@ -4,11 +4,11 @@ import glob
 import os
 import re
 from collections.abc import Sequence
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 from typing import Final
 
 from vstent.errors import ReadError, UnitError
-from vstent.io.files import suffix
+from vstent.io.files import beside, suffix
 
 NRRD_SUFFIXES: Final = (".nrrd", ".nhdr")
 """Suffixes of NRRD files."""
@@ -76,16 +76,16 @@ def fields_of(path: Path) -> dict[str, str]:
 def states_spacing(path: Path, fields: dict[str, str]) -> bool:
     """Return whether a header states three spacings above zero; ITK assumes 1 mm where it does not."""
     if suffix(path) in META_SUFFIXES:
-        return _are_lengths(fields.get("ElementSpacing", fields.get("ElementSize", "")).split()[:3])
+        return are_lengths(fields.get("ElementSpacing", fields.get("ElementSize", "")).split()[:3])
     if "spacedirections" in fields:
         vectors = re.findall(r"none|\([^)]*\)", fields["spacedirections"])
         whole = [vector for vector in vectors if vector != "none" and "nan" not in vector.lower()]
         return len(whole) >= 3
     lengths = fields.get("spacings", "").split()
-    return _are_lengths([length for length in lengths if len(lengths) == 3 or length.lower() != "nan"][:3])
+    return are_lengths([length for length in lengths if len(lengths) == 3 or length.lower() != "nan"][:3])
 
 
-def _are_lengths(words: Sequence[str]) -> bool:
+def are_lengths(words: Sequence[str | bytes]) -> bool:
     """Return whether words are three finite numbers above zero."""
     try:
         return len(words) == 3 and all(0 < float(word) < float("inf") for word in words)
@@ -142,17 +142,9 @@ def voxel_files(path: Path) -> list[Path]:
         return []
     name = os.fsdecode(line[1].strip())
     if name.split()[:1] == ["LIST"]:
-        return [_beside(path, os.fsdecode(one.strip())) for one in head[line.end() :].splitlines()]
+        return [beside(path, os.fsdecode(one.strip()), "voxel file") for one in head[line.end() :].splitlines()]
     if "%" in name:
-        place = _beside(path, name.split()[0])
+        place = beside(path, name.split()[0], "voxel file")
         slices = re.sub(r"%\d*d", "[0-9]*", glob.escape(place.name))
         return [Path(one) for one in sorted(glob.glob(os.path.join(glob.escape(str(place.parent)), slices)))]
-    return [] if name.upper() == "LOCAL" else [_beside(path, name)]
-
-
-def _beside(path: Path, name: str) -> Path:
-    """Return the path of a file that a header names."""
-    # PureWindowsPath knows the separators and roots of all systems.
-    if PureWindowsPath(name).anchor or ".." in PureWindowsPath(name).parts:
-        raise ReadError(f"{path.name} names the voxel file {name[:80]}. Only files beside it or below are read.")
-    return path.parent / name
+    return [] if name.upper() == "LOCAL" else [beside(path, name, "voxel file")]

@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Centerline
 from vstent.io.files import atomic, silenced
-from vstent.io.polydata import cells_of, points_of, polydata_of, ragged_cells
 from vstent.kernels.arrays import Floats, Ints
 
 Arrays = Mapping[str, NDArray[Any]]
-
 """Arrays by name."""
 NOTHING: Final[Arrays] = {}
 """No arrays."""
@@ -29,57 +27,33 @@ SPACE: Final = "LPS"
 
 
 def write_surface(path: Path, surface: Surface, point_data: Arrays = NOTHING, cell_data: Arrays = NOTHING) -> None:
-    """Write a surface in mm as VTP.
-
-    Parameters
-    ----------
-    path : the file.
-    surface : the surface.
-    point_data : arrays (n, ...) on its vertices.
-    cell_data : arrays (m, ...) on its faces.
-    """
-    data = polydata_of(surface.vertices_mm, surface.faces)
-    _attach(data.GetPointData(), point_data, len(surface.vertices_mm))
-    _attach(data.GetCellData(), cell_data, len(surface.faces))
-    _write_xml(path, data)
+    """Write a surface in mm as VTP, with arrays (n, ...) on its vertices and (m, ...) on its faces."""
+    _write_xml(path, polydata_of(surface.vertices_mm, surface.faces), point_data, cell_data)
 
 
 def write_lines(
     path: Path, points_mm: Floats, starts: Ints, point_data: Arrays = NOTHING, cell_data: Arrays = NOTHING
 ) -> None:
-    """Write polylines in mm as VTP.
+    """Write polylines in mm as VTP, with arrays (p, ...) on the points and (w, ...) on the lines.
 
-    Parameters
-    ----------
-    path : the file.
-    points_mm : (p, 3) points of all lines, one after another.
-    starts : (w + 1,) first point of every line, and p at the end.
-    point_data, cell_data : arrays (p, ...) on the points and (w, ...) on the lines.
+    The points (p, 3) of all lines follow one another; `starts` (w + 1,) are the first point of every line, and p.
     """
     from vtkmodules.vtkCommonDataModel import vtkPolyData
 
     data = vtkPolyData()
-    data.SetPoints(points_of(points_mm))
-    data.SetLines(ragged_cells(np.arange(len(points_mm), dtype=np.int32), np.asarray(starts)))
-    _attach(data.GetPointData(), point_data, len(points_mm))
-    _attach(data.GetCellData(), cell_data, len(starts) - 1)
-    _write_xml(path, data)
+    data.SetPoints(_points(points_mm))
+    data.SetLines(_cells(np.arange(len(points_mm)), starts))
+    _write_xml(path, data, point_data, cell_data)
 
 
 def write_centerlines(path: Path, centerlines: Sequence[Centerline]) -> None:
-    """Write centerlines as VTP with the array names of VMTK.
-
-    Parameters
-    ----------
-    path : the file.
-    centerlines : points in mm, inscribed radii and frames.
-    """
+    """Write centerlines as VTP with the array names of VMTK."""
     lengths = [len(line.points_mm) for line in centerlines]
     frames = np.concatenate([line.frames for line in centerlines])
     write_lines(
         path,
         np.concatenate([line.points_mm for line in centerlines]),
-        np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32),
+        np.cumsum([0, *lengths]),
         {
             "MaximumInscribedSphereRadius": np.concatenate([line.inscribed_radius_mm for line in centerlines]),
             "Abscissas": np.concatenate([line.abscissa_mm for line in centerlines]),
@@ -95,23 +69,47 @@ def write_cells(
 ) -> None:
     """Write cells of one or more regular grids as VTU: hexahedra with shared corners.
 
-    Parameters
-    ----------
-    path : the file.
-    centers_mm : (c, 3) centers of the cells, on grids aligned with the axes and with each other.
-    sizes_mm : (c,) edges of the cells, multiples of the smallest.
-    cell_data : arrays (c, ...).
-    point_data : arrays (p, ...) on the corners in the order of `grid_corners`.
+    Their centers (c, 3) are on grids aligned with the axes and with each other; their edges (c,) are multiples of the
+    smallest. There are arrays (c, ...) on the cells, and (p, ...) on the corners in the order of `grid_corners`.
     """
     from vtkmodules.vtkCommonDataModel import VTK_HEXAHEDRON, vtkUnstructuredGrid
 
     corners_mm, cells = grid_corners(centers_mm, sizes_mm)
     data = vtkUnstructuredGrid()
-    data.SetPoints(points_of(corners_mm))
-    data.SetCells(VTK_HEXAHEDRON, cells_of(cells))
-    _attach(data.GetCellData(), cell_data, len(cells))
-    _attach(data.GetPointData(), point_data, len(corners_mm))
-    _write_xml(path, data)
+    data.SetPoints(_points(corners_mm))
+    data.SetCells(VTK_HEXAHEDRON, _cells(cells.ravel(), np.arange(len(cells) + 1) * 8))
+    _write_xml(path, data, point_data, cell_data)
+
+
+def polydata_of(vertices_mm: Floats, faces: Ints) -> Any:
+    """Return a surface of vertices (n, 3) and triangles (m, 3) as vtkPolyData."""
+    from vtkmodules.vtkCommonDataModel import vtkPolyData
+
+    data = vtkPolyData()
+    data.SetPoints(_points(vertices_mm))
+    data.SetPolys(_cells(faces.ravel(), np.arange(len(faces) + 1) * 3))
+    return data
+
+
+def _points(points_mm: Floats) -> Any:
+    """Return points (n, 3) as vtkPoints in double precision."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonCore import vtkPoints
+
+    points = vtkPoints()
+    points.SetData(numpy_to_vtk(np.ascontiguousarray(points_mm, dtype=np.float64), deep=True))
+    return points
+
+
+def _cells(connectivity: Ints, starts: Ints) -> Any:
+    """Return m cells, whose points begin at `starts` (m + 1,), as vtkCellArray."""
+    from vtkmodules.util.numpy_support import numpy_to_vtkIdTypeArray
+    from vtkmodules.vtkCommonDataModel import vtkCellArray
+
+    cells = vtkCellArray()
+    parts = (numpy_to_vtkIdTypeArray(np.asarray(ids, dtype=np.int64), deep=True) for ids in (starts, connectivity))
+    cells.SetData(*parts)
+    return cells
 
 
 _CORNERS: Final = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)])
@@ -137,26 +135,24 @@ def grid_corners(centers_mm: Floats, sizes_mm: Floats) -> tuple[Floats, Ints]:
     return origin + (lattice - 0.5) * size_mm, cells.reshape(-1, 8).astype(np.int32)
 
 
-def _attach(attributes: Any, arrays: Arrays, length: int) -> None:
-    """Add arrays of `length` rows to the attributes of a VTK data set."""
+def _write_xml(path: Path, data: Any, point_data: Arrays, cell_data: Arrays) -> None:
+    """Write a VTK data set as VTP or VTU, with its arrays and its frame."""
     from vtkmodules.util.numpy_support import numpy_to_vtk
-
-    for name, values in arrays.items():
-        array = np.asarray(values)
-        if len(array) != length:
-            raise ValueError(f"{name} has {len(array)} rows where {length} are needed")
-        if array.dtype.kind == "b":
-            array = array.astype(np.uint8)
-        data = numpy_to_vtk(np.ascontiguousarray(array.reshape(length, -1) if array.ndim > 1 else array), deep=True)
-        data.SetName(name)
-        attributes.AddArray(data)
-
-
-def _write_xml(path: Path, data: Any) -> None:
-    """Write a VTK data set as VTP or VTU, with its frame."""
     from vtkmodules.vtkCommonCore import vtkStringArray
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter, vtkXMLUnstructuredGridWriter
 
+    for attributes, arrays, length in (
+        (data.GetPointData(), point_data, data.GetNumberOfPoints()),
+        (data.GetCellData(), cell_data, data.GetNumberOfCells()),
+    ):
+        for name, values in arrays.items():
+            array = np.asarray(values)
+            if len(array) != length:
+                raise ValueError(f"{name} has {len(array)} rows where {length} are needed")
+            array = array.astype(np.uint8) if array.dtype.kind == "b" else array
+            rows = numpy_to_vtk(np.ascontiguousarray(array.reshape(length, -1) if array.ndim > 1 else array), deep=True)
+            rows.SetName(name)
+            attributes.AddArray(rows)
     frame = vtkStringArray()
     frame.SetName("SPACE")
     frame.InsertNextValue(SPACE)
@@ -191,16 +187,8 @@ def write_stl(path: Path, surface: Surface) -> None:
 def write_json(path: Path, content: Any, *, is_exact: bool = False) -> None:
     """Write numbers, strings, lists, mappings and arrays as JSON with sorted keys.
 
-    Parameters
-    ----------
-    path : the file.
-    content : what is written.
-    is_exact : whether floats are written without rounding; otherwise they have seven digits.
-
-    Raises
-    ------
-    ValueError
-        A number is not finite, or an object is of another type; nothing is written.
+    Floats have seven digits unless `is_exact`. ValueError is raised where a number is not finite, or an object is of
+    another type; nothing is written then.
     """
     plain = _plain(content, "", is_exact)
     write_text(path, json.dumps(plain, indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False) + "\n")
