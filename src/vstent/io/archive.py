@@ -47,17 +47,7 @@ def save_data(path: Path, value: Any) -> None:
     """Write a data class of vstent with everything it contains.
 
     Fields may be arrays, numbers, strings, booleans, None, tuples, lists, dictionaries with string keys, and data
-    classes of vstent, nested to any depth.
-
-    Parameters
-    ----------
-    path : the file to write.
-    value : the data class.
-
-    Raises
-    ------
-    TypeError
-        A field is of another type; nothing is written.
+    classes of vstent, nested to any depth. TypeError is raised for another type; nothing is written then.
     """
     arrays: dict[str, NDArray[Any]] = {}
     text = json.dumps(_packed(value, arrays))
@@ -67,22 +57,15 @@ def save_data(path: Path, value: Any) -> None:
 
 
 def load_data(path: Path, kind: type[Saved]) -> Saved:
-    """Read a data class.
+    """Read a data class of the type `kind`, written by `save_data`.
 
-    Parameters
-    ----------
-    path : a file written by `save_data`.
-    kind : expected type.
-
-    Raises
-    ------
-    ReadError
-        The file is missing, damaged, of another version, or holds another type.
+    ReadError is raised where the file is missing, damaged, of another version, or holds another type.
     """
     path = existing(path)
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            _refuse_bomb(archive)
+            if sum(entry.file_size for entry in archive.zip.infolist()) > MOST_BYTES:
+                raise ValueError("the archive unpacks to too many bytes")
             value = _unpacked(json.loads(archive["noun"].tobytes()), archive)
     except DAMAGE:
         raise ReadError(
@@ -93,12 +76,6 @@ def load_data(path: Path, kind: type[Saved]) -> Saved:
             f"{path} holds a {type(value).__name__} where a {kind.__name__} is needed. Delete it to compute it again."
         )
     return value
-
-
-def _refuse_bomb(archive: Any) -> None:
-    """Raise ValueError where the archive would unpack to more than `MOST_BYTES`."""
-    if sum(entry.file_size for entry in archive.zip.infolist()) > MOST_BYTES:
-        raise ValueError("the archive unpacks to too many bytes")
 
 
 def _packed(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
@@ -133,15 +110,8 @@ def _unpacked(value: Any, archive: Any) -> Any:
         return tuple(items) if kind == "tuple" else items
     if kind == "dict":
         return {key: _unpacked(item, archive) for key, item in value["items"].items()}
-    fields = {name: _unpacked(item, archive) for name, item in value["fields"].items()}
-    return _class_of(value["module"], value["class"])(**fields)
-
-
-def _class_of(module: str, name: str) -> type:
-    """Return a data class of vstent by module and name; ValueError is raised for anything else."""
-    if not module.startswith(_ROOT):
+    module, name = value["module"], value["class"]
+    noun = getattr(importlib.import_module(module), name) if module.startswith(_ROOT) else None
+    if not (isinstance(noun, type) and dataclasses.is_dataclass(noun) and noun.__module__ == module):
         raise ValueError(f"{module}.{name} is not a data class of vstent")
-    found = getattr(importlib.import_module(module), name)
-    if not (isinstance(found, type) and dataclasses.is_dataclass(found) and found.__module__ == module):
-        raise ValueError(f"{module}.{name} is not a data class of vstent")
-    return found
+    return noun(**{name: _unpacked(item, archive) for name, item in value["fields"].items()})

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vstent.geometry.image import Image
-from vstent.kernels.arrays import Floats
 
 NEGLIGIBLE_MM: Final = 0.01
 """Displacement in mm below which a shear is a rounding error of the header and is not reported."""
@@ -23,54 +22,26 @@ def rectangular(image: Image) -> Image:
     """
     edges = np.array(image.affine_mm[:3, :3])
     spacing_mm = np.linalg.norm(edges, axis=0)
-    nearest = _nearest_rotation(edges / spacing_mm)
-    moved_mm = _largest_displacement_mm(edges - nearest * spacing_mm, image.voxels.shape)
+    directions = edges / spacing_mm
+    left, _, right = np.linalg.svd(directions)
+    nearest = left @ right * spacing_mm  # the same handedness
+    half = 0.5 * (np.array(image.voxels.shape) - 1)
+    corners = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1) * half[:, None]
+    moved_mm = float(np.linalg.norm((edges - nearest) @ corners, axis=0).max())
     if moved_mm < NEGLIGIBLE_MM * min(1.0, float(spacing_mm.min())):
         return image
-    angle_deg = _worst_angle_deg(edges / spacing_mm)
-    if moved_mm <= SMALL_VOXELS * float(spacing_mm.min()):
-        return _turned(image, nearest * spacing_mm, angle_deg, moved_mm)
-    return _resampled(image, angle_deg)
-
-
-def _nearest_rotation(directions: Floats) -> Floats:
-    """Return the orthonormal matrix (3, 3) nearest to a matrix of unit columns, with the same handedness."""
-    left, _, right = np.linalg.svd(directions)
-    return np.asarray(left @ right)
-
-
-def _largest_displacement_mm(change_mm: Floats, shape: tuple[int, ...]) -> float:
-    """Return the displacement of the farthest corner where the voxel edges (3, 3) change and the center is fixed."""
-    half = 0.5 * (np.array(shape, dtype=np.float64) - 1)
-    corners = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1) * half[:, None]
-    return float(np.linalg.norm(change_mm @ corners, axis=0).max())
-
-
-def _worst_angle_deg(directions: Floats) -> float:
-    """Return the largest deviation of two axes from a right angle, in degrees."""
     cosine = np.abs(np.triu(directions.T @ directions, k=1)).max()
-    return float(np.degrees(np.arcsin(min(cosine, 1.0))))
-
-
-def _centered(edges: Floats, image: Image) -> Floats:
-    """Return the affine with other voxel edges (3, 3) that keeps the center of the volume."""
-    half = 0.5 * (np.array(image.voxels.shape) - 1)
+    skew = f"The image axes are not perpendicular (off by {np.degrees(np.arcsin(min(cosine, 1.0))):.1f} degrees"
+    if moved_mm > SMALL_VOXELS * float(spacing_mm.min()):
+        return _resampled(image, skew)
     affine = np.eye(4)
-    affine[:3, :3] = edges
-    affine[:3, 3] = image.affine_mm[:3, :3] @ half + image.affine_mm[:3, 3] - edges @ half
-    return affine
+    affine[:3, :3] = nearest
+    affine[:3, 3] = image.affine_mm[:3, :3] @ half + image.affine_mm[:3, 3] - nearest @ half
+    note = f"{skew}): the nearest rectangular frame is used, which moves voxels by at most {moved_mm:.2f} mm."
+    return Image(image.voxels, affine, image.modality, (*image.notes, note))
 
 
-def _turned(image: Image, edges: Floats, angle_deg: float, moved_mm: float) -> Image:
-    """Return an image with a rectangular frame and a note on it."""
-    note = (
-        f"The image axes are not perpendicular (off by {angle_deg:.1f} degrees): the nearest rectangular frame is "
-        f"used, which moves voxels by at most {moved_mm:.2f} mm."
-    )
-    return Image(image.voxels, _centered(edges, image), image.modality, (*image.notes, note))
-
-
-def _resampled(image: Image, angle_deg: float) -> Image:
+def _resampled(image: Image, skew: str) -> Image:
     """Return the image on a rectangular grid that spans the sheared volume; voxels outside it get the lowest value."""
     from scipy.ndimage import affine_transform
 
@@ -91,7 +62,7 @@ def _resampled(image: Image, angle_deg: float) -> Image:
     affine[:3, :3] = edges
     affine[:3, 3] = image.affine_mm[:3, 3] + edges @ low
     note = (
-        f"The image axes are not perpendicular (off by {angle_deg:.1f} degrees, gantry tilt?): the voxels were "
-        f"resampled on a rectangular grid of {' x '.join(f'{v:.3g}' for v in spacing_mm)} mm."
+        f"{skew}, gantry tilt?): the voxels were resampled on a rectangular grid of "
+        f"{' x '.join(f'{v:.3g}' for v in spacing_mm)} mm."
     )
     return Image(voxels, affine, image.modality, (*image.notes, note))

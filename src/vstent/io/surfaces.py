@@ -64,122 +64,6 @@ def read_surface(
     """
     path = existing(path)
     surface, stated = _read(path)
-    surface = _checked(surface, path)
-    if units is not None and units not in get_args(Unit):
-        raise UnitError(f"Unit {units} is not known: give m, cm or mm.")
-    surface, notes = _in_lps(surface, frame, stated)
-    inner = inner_wall(_joined(surface))
-    if inner is not None:
-        surface, notes = inner, (*notes, "The file holds an inner and an outer wall: the inner one is used.")
-    size, diameter = _diagonal(surface), hydraulic_diameter(surface)
-    unit = _guessed(size, diameter, path) if units is None else _accepted(units, size, diameter, path)
-    if units is None:
-        notes = (
-            *notes,
-            f"Length unit: {unit}, derived from the size (hydraulic diameter {diameter * MM_PER[unit]:.2f} mm, "
-            f"extent {size * MM_PER[unit]:.0f} mm). If it is wrong, give the unit (--units).",
-        )
-    return Surface(surface.vertices_mm * MM_PER[unit], surface.faces), notes
-
-
-RAS_TO_LPS: Final = np.array([-1.0, -1.0, 1.0])
-"""Factors that convert RAS coordinates to LPS, and back."""
-
-
-def _in_lps(surface: Surface, given: Frame | None, stated: str) -> tuple[Surface, tuple[str, ...]]:
-    """Return a surface in LPS, and a note where the file states RAS; a given frame overrides the stated one."""
-    if given not in (None, *get_args(Frame)):
-        raise UnitError(f"Frame {given} is not known: give lps or ras.")
-    if (given or stated.lower()) != "ras":
-        return surface, ()
-    turned = Surface(surface.vertices_mm * RAS_TO_LPS, surface.faces)
-    return turned, () if given else ("The file states RAS coordinates (SPACE=RAS): they were converted to LPS.",)
-
-
-def _read(path: Path) -> tuple[Surface, str]:
-    """Return the surface in the unit and frame of the file, and the frame that the file states; empty where none."""
-    kind = suffix(path)
-    if kind not in SURFACE_SUFFIXES:
-        raise ReadError(
-            f"{path.name} is not a surface file that vstent reads. Give one of {', '.join(SURFACE_SUFFIXES)}."
-        )
-    if path.is_dir() or path.stat().st_size == 0:
-        raise ReadError(f"{path.name} is {'a folder' if path.is_dir() else 'empty'}, not a surface file.")
-    if is_vtk_image(path):
-        raise ReadError(f"{path.name} is a scan, not a surface. Read it with vstent.read_image.")
-    _refuse_mislabelled(path, kind)
-    if kind == ".stl" and _is_torn_text(path):
-        raise ReadError(f"{path.name} holds fewer triangles than it states: it breaks off. Copy or export it again.")
-    with read_apart("mesh", path, {}, [path]) as (arrays, words):
-        return Surface(arrays["vertices"], arrays["faces"]), words["space"] or _stated_frame(path, kind)
-
-
-SPACE: Final = re.compile(rb"SPACE\s*[=:]\s*(RAS|LPS)", re.IGNORECASE)
-"""Pattern by which 3D Slicer states the frame in a header or comment."""
-_HEAD_ENDS: Final = {".stl": b"facet", ".ply": b"end_header", ".obj": b"\nv ", ".vtk": b"DATASET"}
-"""First text after the header of a file, by its suffix."""
-
-
-def _stated_frame(path: Path, kind: str) -> str:
-    """Return the frame that a header or comment states: ``RAS``, ``LPS`` or empty."""
-    with path.open("rb") as file:
-        head = file.read(4096)
-    if kind == ".stl" and not _is_ascii_stl(head):
-        head = head[:80]
-    found = SPACE.search(head.partition(_HEAD_ENDS[kind])[0]) if kind in _HEAD_ENDS else None
-    return found[1].decode().upper() if found else ""
-
-
-TAIL_BYTES: Final = 4096
-"""Number of bytes at the end of an STL text file that contain its last line."""
-_BEGINS: Final = {**dict.fromkeys((".vtp", ".vtu", ".vtm"), (b"<",)), ".vtk": (b"# vtk",), ".ply": (b"ply",)}
-"""First bytes of a file by its suffix."""
-
-
-def _refuse_mislabelled(path: Path, kind: str) -> None:
-    """Raise ReadError where the first bytes are those of another format, on which VTK's readers may hang or crash."""
-    with path.open("rb") as file:
-        head = file.read(512)
-    wrong = kind in _BEGINS and not head.lstrip(b"\xef\xbb\xbf \r\n\t").lower().startswith(_BEGINS[kind])
-    if kind == ".stl":
-        wrong = not (_is_ascii_stl(head) or _is_binary_stl(path, head))
-    if kind == ".stl" and wrong and not head.lstrip().lower().startswith(b"solid") and len(head) >= 84:
-        raise ReadError(
-            f"{path.name} breaks off, or is not a .stl file: its header states {_n_stl(head)} triangles and there is "
-            f"room for {(path.stat().st_size - 84) // 50}. Copy or export it again."
-        )
-    if wrong:
-        raise ReadError(f"{path.name} is not a {kind} file: it begins with {head[:16]!r}. Export it again.")
-
-
-def _is_ascii_stl(head: bytes) -> bool:
-    """Return whether a file starts like an STL text file."""
-    return head.removeprefix(codecs.BOM_UTF8).lstrip().lower().startswith(b"solid") and (
-        b"facet" in head.lower() or len(head) == 512
-    )
-
-
-def _is_binary_stl(path: Path, head: bytes) -> bool:
-    """Return whether a file is long enough for the triangles that its binary STL header states."""
-    return len(head) >= 84 and path.stat().st_size >= 84 + 50 * _n_stl(head)
-
-
-def _is_torn_text(path: Path) -> bool:
-    """Return whether an STL text file is truncated; VTK reads some of these as if they were binary."""
-    with path.open("rb") as file:
-        head = file.read(512)
-        file.seek(-min(TAIL_BYTES, path.stat().st_size), os.SEEK_END)
-        tail = file.read().lower()
-    return _is_ascii_stl(head) and not _is_binary_stl(path, head) and b"endsolid" not in tail
-
-
-def _n_stl(head: bytes) -> int:
-    """Return the number of triangles that the header of a binary STL file states."""
-    return int.from_bytes(head[80:84], "little")
-
-
-def _checked(surface: Surface, path: Path) -> Surface:
-    """Return a surface; ReadError is raised where it has too few triangles, invalid vertices or no area."""
     if len(surface.faces) < 4:
         raise ReadError(
             f"{path.name} holds {len(surface.faces)} triangles, too few for a vessel. Give the wall of the vessel."
@@ -191,7 +75,85 @@ def _checked(surface: Surface, path: Path) -> Surface:
         )
     if not surface.areas_mm2.sum() > 0 or not np.isfinite(_diagonal(surface)):
         raise ReadError(f"{path.name} has no area: all its triangles are lines or points. Export it again.")
-    return surface
+    if units is not None and units not in get_args(Unit):
+        raise UnitError(f"Unit {units} is not known: give m, cm or mm.")
+    if frame not in (None, *get_args(Frame)):
+        raise UnitError(f"Frame {frame} is not known: give lps or ras.")
+    notes: tuple[str, ...] = ()
+    if (frame or stated.lower()) == "ras":
+        surface = Surface(surface.vertices_mm * RAS_TO_LPS, surface.faces)
+        notes = () if frame else ("The file states RAS coordinates (SPACE=RAS): they were converted to LPS.",)
+    inner = inner_wall(_joined(surface))
+    if inner is not None:
+        surface, notes = inner, (*notes, "The file holds an inner and an outer wall: the inner one is used.")
+    size, diameter = _diagonal(surface), hydraulic_diameter(surface)
+    unit = units or _guessed(size, diameter, path)
+    if units is None:
+        notes = (
+            *notes,
+            f"Length unit: {unit}, derived from the size (hydraulic diameter {diameter * MM_PER[unit]:.2f} mm, "
+            f"extent {size * MM_PER[unit]:.0f} mm). If it is wrong, give the unit (--units).",
+        )
+    elif not _fits(size * MM_PER[unit], diameter * MM_PER[unit], GIANT_DIAMETER_MM):
+        raise UnitError(
+            f"{path.name} in {unit} would be {size * MM_PER[unit]:.4g} mm long with a hydraulic diameter of "
+            f"{diameter * MM_PER[unit]:.4g} mm, which no brain vessel has. Give another unit (--units)."
+        )
+    return Surface(surface.vertices_mm * MM_PER[unit], surface.faces), notes
+
+
+RAS_TO_LPS: Final = np.array([-1.0, -1.0, 1.0])
+"""Factors that convert RAS coordinates to LPS, and back."""
+TAIL_BYTES: Final = 4096
+"""Number of bytes at the end of an STL text file that contain its last line."""
+_BEGINS: Final = {**dict.fromkeys((".vtp", ".vtu", ".vtm"), b"<"), ".vtk": b"# vtk", ".ply": b"ply"}
+"""First bytes of a file by its suffix."""
+SPACE: Final = re.compile(rb"SPACE\s*[=:]\s*(RAS|LPS)", re.IGNORECASE)
+"""Pattern by which 3D Slicer states the frame in a header or comment."""
+_HEAD_ENDS: Final = {".stl": b"facet", ".ply": b"end_header", ".obj": b"\nv ", ".vtk": b"DATASET"}
+"""First text after the header of a file, by its suffix."""
+
+
+def _read(path: Path) -> tuple[Surface, str]:
+    """Return the surface in the unit and frame of the file, and the frame that it states; empty where it states none.
+
+    Other formats than that of the suffix are refused first: VTK's readers may hang or crash on them.
+    """
+    kind = suffix(path)
+    if kind not in SURFACE_SUFFIXES:
+        raise ReadError(
+            f"{path.name} is not a surface file that vstent reads. Give one of {', '.join(SURFACE_SUFFIXES)}."
+        )
+    if path.is_dir() or (n_bytes := path.stat().st_size) == 0:
+        raise ReadError(f"{path.name} is {'a folder' if path.is_dir() else 'empty'}, not a surface file.")
+    if is_vtk_image(path):
+        raise ReadError(f"{path.name} is a scan, not a surface. Read it with vstent.read_image.")
+    with path.open("rb") as file:
+        head = file.read(4096)
+        file.seek(-min(TAIL_BYTES, n_bytes), os.SEEK_END)
+        tail = file.read().lower()
+    is_text = head[:512].removeprefix(codecs.BOM_UTF8).lstrip().lower().startswith(b"solid") and (
+        b"facet" in head[:512].lower() or n_bytes >= 512
+    )
+    n_stated = int.from_bytes(head[80:84], "little")  # triangles of a binary STL file
+    is_whole = n_bytes >= 84 + 50 * n_stated
+    is_wrong = not head.lstrip(b"\xef\xbb\xbf \r\n\t").lower().startswith(_BEGINS.get(kind, b""))
+    if kind == ".stl" and not is_text and not is_whole:
+        is_wrong = True
+        if n_bytes >= 84 and not head.lstrip().lower().startswith(b"solid"):
+            raise ReadError(
+                f"{path.name} breaks off, or is not a .stl file: its header states {n_stated} triangles and there is "
+                f"room for {(n_bytes - 84) // 50}. Copy or export it again."
+            )
+    if is_wrong:
+        raise ReadError(f"{path.name} is not a {kind} file: it begins with {head[:16]!r}. Export it again.")
+    if kind == ".stl" and is_text and not is_whole and b"endsolid" not in tail:  # VTK reads some of these as binary
+        raise ReadError(f"{path.name} holds fewer triangles than it states: it breaks off. Copy or export it again.")
+    with read_apart("mesh", path, {}, [path]) as (arrays, words):
+        surface = Surface(arrays["vertices"], arrays["faces"])
+    header = head[:80] if kind == ".stl" and not is_text else head
+    stated = SPACE.search(header.partition(_HEAD_ENDS[kind])[0]) if kind in _HEAD_ENDS else None
+    return surface, words["space"] or (stated[1].decode().upper() if stated else "")
 
 
 def _joined(surface: Surface) -> Surface:
@@ -235,13 +197,3 @@ def _guessed(size: float, diameter: float, path: Path) -> str:
             f"{diameter:.4g}, and vessels have {VESSEL_DIAMETER_MM[0]:g} to {GIANT_DIAMETER_MM:g} mm. Scale it to mm."
         )
     return min(fitting, key=lambda unit: abs(np.log(diameter * MM_PER[unit] / TYPICAL_DIAMETER_MM)))
-
-
-def _accepted(unit: str, size: float, diameter: float, path: Path) -> str:
-    """Return a given unit; UnitError is raised where the size is implausible."""
-    if not _fits(size * MM_PER[unit], diameter * MM_PER[unit], GIANT_DIAMETER_MM):
-        raise UnitError(
-            f"{path.name} in {unit} would be {size * MM_PER[unit]:.4g} mm long with a hydraulic diameter of "
-            f"{diameter * MM_PER[unit]:.4g} mm, which no brain vessel has. Give another unit (--units)."
-        )
-    return unit

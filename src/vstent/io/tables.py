@@ -4,6 +4,7 @@ import csv
 import io
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,55 +17,52 @@ from vstent.kernels.arrays import Floats
 
 
 def read_columns(path: Path, count: int) -> Floats:
-    """Read a CSV file of numbers as an array; lines above the first number are titles.
+    """Return the numbers (n, `count`) of a CSV file with commas, semicolons or tabs.
 
-    Parameters
-    ----------
-    path : the file; columns are separated by commas, semicolons or tabs.
-    count : number of columns.
-
-    Returns (n, count) numbers.
-
-    Raises
-    ------
-    ReadError
-        The file is missing, or a line does not hold `count` finite numbers.
+    Lines above the first number are titles. ReadError is raised where the file is missing, or a line does not hold
+    `count` finite numbers.
     """
-    lines = existing(path).read_text(encoding="utf-8-sig", errors="replace").splitlines()
     rows: list[list[float]] = []
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(existing(path).read_text("utf-8-sig", "replace").splitlines(), start=1):
         words = [word for word in line.replace(";", ",").replace("\t", ",").split(",") if word.strip()]
-        values = [_number(word) for word in words]
-        is_title = not rows and all(value is None for value in values)
-        if not values or is_title:
+        values = [value for word in words if math.isfinite(value := _number(word))]
+        if not words or (not rows and not values):
             continue
-        if len(values) != count or None in values:
+        if not len(values) == len(words) == count:
             raise ReadError(
                 f"line {number} of {path} is {line[:60]!r}: give {count} finite numbers, with decimal points, "
                 "separated by commas"
             )
-        rows.append([float(value) for value in values if value is not None])
+        rows.append(values)
     if not rows:
         raise ReadError(f"{path} holds no numbers: give {count} columns, separated by commas")
     return np.array(rows)
 
 
+def _number(word: str) -> float:
+    """Return a number read from text; NaN where it is none."""
+    with suppress(ValueError):
+        return float(word)
+    return math.nan
+
+
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows of named values as CSV.
+    """Write rows of named values as CSV, with one column per name in the order of first use.
 
-    There is one column per name in the order of first use. Missing values are empty, floats have seven digits, and
-    booleans are ``true`` and ``false``.
-
-    Parameters
-    ----------
-    path : the file.
-    rows : values by column name.
+    Missing values are empty, floats have seven digits, and booleans are ``true`` and ``false``.
     """
+
+    def plain(value: Any) -> Any:
+        """Return a value as it is written."""
+        if isinstance(value, bool | np.bool_):
+            return "true" if value else "false"
+        return f"{value:.{SIGNIFICANT_DIGITS}g}" if isinstance(value, float) else value
+
     names = columns_of(rows)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(names)
-    writer.writerows([_plain(row.get(name)) for name in names] for row in rows)
+    writer.writerows([plain(row.get(name)) for name in names] for row in rows)
     write_text(path, text.getvalue())
 
 
@@ -74,15 +72,7 @@ def columns_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def write_parquet(path: Path, rows: Sequence[Mapping[str, Any]]) -> bool:
-    """Write rows of named values as Parquet.
-
-    Parameters
-    ----------
-    path : the file.
-    rows : values by column name.
-
-    Returns False where pyarrow is not installed; nothing is written then.
-    """
+    """Write rows of named values as Parquet; return False where pyarrow is not installed, and write nothing then."""
     try:
         from pyarrow import parquet, table
     except ImportError:
@@ -90,19 +80,3 @@ def write_parquet(path: Path, rows: Sequence[Mapping[str, Any]]) -> bool:
     with atomic(path) as partial:
         parquet.write_table(table({name: [row.get(name) for row in rows] for name in columns_of(rows)}), partial)
     return True
-
-
-def _plain(value: Any) -> Any:
-    """Return a value as it is written to a CSV file."""
-    if isinstance(value, bool | np.bool_):
-        return "true" if value else "false"
-    return f"{value:.{SIGNIFICANT_DIGITS}g}" if isinstance(value, float) else value
-
-
-def _number(word: str) -> float | None:
-    """Return a finite number read from text, or None."""
-    try:
-        value = float(word)
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None

@@ -26,15 +26,8 @@ MM_PER_WORD: Final = {
 _META_GEOMETRY: Final = {
     key.lower(): key
     for key in (
-        "ElementSpacing",
-        "ElementSize",
-        "Offset",
-        "Position",
-        "Origin",
-        "TransformMatrix",
-        "Rotation",
-        "Orientation",
-        "DistanceUnits",
+        *("ElementSpacing", "ElementSize", "Offset", "Position", "Origin", "TransformMatrix", "Rotation"),
+        *("Orientation", "DistanceUnits"),
     )
 }
 """Keys of a MetaImage header that place the voxels, by their small letters; ITK skips other spellings."""
@@ -50,10 +43,7 @@ _ENDS: Final = {
 def fields_of(path: Path) -> dict[str, str]:
     """Return the fields of a header; the names of NRRD fields are in small letters and without spaces.
 
-    Raises
-    ------
-    ReadError
-        The header does not end, or, in a MetaImage header, ITK skips a line together with the next one, or a key.
+    ReadError is raised where it does not end, or where ITK skips a key of a MetaImage header, or a line and the next.
     """
     with path.open("rb") as file:
         parts = _ENDS[suffix(path)].split(file.read(HEAD_BYTES), maxsplit=1)
@@ -100,13 +90,7 @@ def holds_segments(path: Path) -> bool:
 
 
 def mm_per_unit(path: Path, fields: dict[str, str]) -> list[float]:
-    """Return the length in mm of the unit along each of three axes.
-
-    Raises
-    ------
-    UnitError
-        The header names a unit that is not known.
-    """
+    """Return the length in mm of the unit along each of three axes; UnitError is raised for unknown units."""
     stated = fields.get("DistanceUnits") or fields.get("spaceunits") or fields.get("units") or ""
     words = re.findall(r'"([^"]*)"', stated) if '"' in stated else stated.split()
     lengths = [MM_PER_WORD.get(word.strip().lower()) for word in words]
@@ -126,13 +110,7 @@ APART: Final = {
 
 
 def voxel_files(path: Path) -> list[Path]:
-    """Return the voxel files that a header names, whether they exist or not.
-
-    Raises
-    ------
-    ReadError
-        A header names a file that is not in its own folder or below it.
-    """
+    """Return the voxel files that a header names, whether they exist or not; only those beside it are allowed."""
     kind = suffix(path)
     if kind not in APART:
         return []
