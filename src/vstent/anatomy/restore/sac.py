@@ -24,7 +24,7 @@ FLAT: Final = 0.2
 """A sac is rejected as uneven wall if its volume is below this fraction of (neck area)^(3/2); a half sphere has
 0.38."""
 ROUND: Final = 0.6
-"""A shape is rejected as debris of the scan if its `_roundness` is below this. Sacs, including lobed ones, have 0.7 to
+"""A shape is rejected as debris of the scan if its sphericity is below this. Sacs, including lobed ones, have 0.7 to
 0.85."""
 PASSING: Final = 2.5
 """A branch passes under a sac that begins within this many of the branch's radii."""
@@ -53,10 +53,7 @@ ON_SAC_MM: Final = 0.05
 
 
 def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], bulge: Bulge) -> Aneurysm | None:
-    """Cut the sac of a bulge off the lumen.
-
-    Side branches that arise from the sac or beside it are cut off along their own tubes.
-    """
+    """Cut the sac of a bulge off the lumen, and branches that arise from it or beside it off along their own tubes."""
     lumen = vessel.lumen
     artery = _artery(vessel, landing, side_lines, bulge)
     height_mm = artery.height_mm(lumen.vertices_mm, lumen.vertex_normals)
@@ -79,14 +76,11 @@ def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], 
 
 
 def is_sac(aneurysm: Aneurysm) -> bool:
-    """Return whether a shape that was cut off is neither flat nor debris of the scan.
-
-    Parameters
-    ----------
-    aneurysm : shape and neck.
-    """
-    is_flat = aneurysm.sac.volume_mm3 < FLAT * aneurysm.neck.area_mm2**1.5
-    return not is_flat and _roundness(aneurysm.sac) >= ROUND
+    """Return whether a shape that was cut off is neither flat nor debris of the scan."""
+    volume_mm3, area_mm2 = aneurysm.sac.volume_mm3, aneurysm.sac.area_mm2
+    # Sphericity: area of the sphere of equal volume over the sac's (Wadell 1935, J. Geol. 43:250).
+    roundness = float(np.cbrt(36 * np.pi * max(volume_mm3, 0.0) ** 2)) / area_mm2
+    return volume_mm3 >= FLAT * aneurysm.neck.area_mm2**1.5 and roundness >= ROUND
 
 
 def is_beside_branch(landing: Landing, side_lines: Sequence[Centerline], bulge: Bulge) -> bool:
@@ -113,10 +107,7 @@ def _low_mm(vessel: Vessel, landing: Landing, bulge: Bulge) -> float:
 
 
 def is_in_one(points_mm: Floats, aneurysms: Sequence[Aneurysm]) -> bool:
-    """Return whether most points of a sac or bulge lie in or on one of the aneurysms.
-
-    Shapes: `points_mm` (n, 3).
-    """
+    """Return whether most points (n, 3) of a sac or bulge lie in or on one of the aneurysms."""
     return any(np.median(one.sac.signed_distance(points_mm)) < ON_SAC_MM for one in aneurysms)
 
 
@@ -134,16 +125,8 @@ def drawn_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline]
     return _aneurysm(artery, Flank(vertices, faces, np.zeros(len(vertices)), rim), loops, rings)
 
 
-def _aneurysm(artery: Artery, flank: Flank, other_loops: list[Ints], rings: Floats) -> Aneurysm:
-    """Return the aneurysm of a flank, its branch mouths, and its continuation, rings (n, k, 3), down to the neck."""
-    neck = _neck(artery, rings[-1])
-    sac = _closed_sac(flank, other_loops, rings, neck)
-    return Aneurysm(sac, neck, rings[-1])
-
-
-def _is_island(lumen: Surface, is_low: Bools) -> Bools:
+def is_island(lumen: Surface, is_low: Bools) -> Bools:
     """Return whether each vertex (n,) is low wall without a connection to an opening over low wall."""
-    # There the sac touches an artery from which it does not arise.
     edges = triangles.directed_edges(lumen.faces)
     edges = edges[is_low[edges].all(axis=1)]
     label = triangles.joined(edges, len(is_low))
@@ -151,16 +134,12 @@ def _is_island(lumen: Surface, is_low: Bools) -> Bools:
     return is_low & ~np.isin(label, label[ends[is_low[ends]]])
 
 
-def _roundness(sac: Surface) -> float:
-    """Return the sphericity: area of the sphere of equal volume over the sac's (Wadell 1935, J. Geol. 43:250)."""
-    return float(np.cbrt(36 * np.pi * max(sac.volume_mm3, 0.0) ** 2)) / sac.area_mm2
-
-
 def _flank(
     lumen: Surface, height_mm: Floats, low_mm: float, dome_mm: Floats, landing: Landing
 ) -> tuple[Flank | None, list[Ints]]:
     """Return the sac's wall above a height and its edges other than the rim; None where it is not on the artery."""
-    is_touching = _is_island(lumen, height_mm < low_mm)
+    # There the sac touches an artery from which it does not arise.
+    is_touching = is_island(lumen, height_mm < low_mm)
     height_mm = np.where(is_touching, 2.0 * low_mm, height_mm)
     level = _level(lumen, height_mm, low_mm)
     placed, faces, _ = triangles.clip(np.column_stack([lumen.vertices_mm, height_mm]), lumen.faces, level)
@@ -312,21 +291,19 @@ def _neck(artery: Artery, rim_mm: Floats) -> Surface:
     return Surface(vertices, np.concatenate(faces))
 
 
-def _closed_sac(flank: Flank, other_loops: list[Ints], rings: Floats, neck: Surface) -> Surface:
-    """Return the closed surface of a sac: its wall, the caps of its branches, its continuation and its neck."""
+def _aneurysm(artery: Artery, flank: Flank, other_loops: list[Ints], rings: Floats) -> Aneurysm:
+    """Return the aneurysm of a flank, its branch mouths, and its continuation, rings (n, k, 3), down to the neck."""
+    neck = _neck(artery, rings[-1])
     points, wall = triangles.cap(flank.vertices_mm, flank.faces, other_loops)
     n_below, k = len(rings) - 1, len(flank.rim)
     # The first ring of the skirt is the rim, and its last ring is the first ring of the neck: these vertices are
     # shared.
     number = np.concatenate([flank.rim, len(points) + np.arange(n_below * k)]).reshape(-1, k)
-    strips = [_strip(number[i], number[i + 1]) for i in range(n_below)]
+    upper, lower = number[:-1], number[1:]
+    ahead_up, ahead_low = np.roll(upper, -1, axis=1), np.roll(lower, -1, axis=1)
+    strips = np.stack([ahead_up, upper, lower, ahead_up, lower, ahead_low], axis=-1)
+    strips = strips.reshape(n_below, k, 2, 3).transpose(0, 2, 1, 3).reshape(-1, 3)
     first = len(points) + n_below * k
     on_neck = np.concatenate([number[-1], first + np.arange(len(neck.vertices_mm) - k)])
     vertices = np.concatenate([points, rings[1:].reshape(-1, 3), neck.vertices_mm[k:]])
-    return Surface(vertices, np.concatenate([wall, *strips, on_neck[neck.faces[:, ::-1]]]))
-
-
-def _strip(upper: Ints, lower: Ints) -> Ints:
-    """Return outward triangles between two rings of vertices (k,) that run in the direction of the wall above them."""
-    ahead_up, ahead_low = np.roll(upper, -1), np.roll(lower, -1)
-    return np.concatenate([np.stack([ahead_up, upper, lower], 1), np.stack([ahead_up, lower, ahead_low], 1)])
+    return Aneurysm(Surface(vertices, np.concatenate([wall, strips, on_neck[neck.faces[:, ::-1]]])), neck, rings[-1])
