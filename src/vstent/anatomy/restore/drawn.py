@@ -10,7 +10,7 @@ from vstent.errors import InputError
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Vessel
 from vstent.kernels import curves, triangles
-from vstent.kernels.arrays import Bools, Floats, Ints
+from vstent.kernels.arrays import Floats, Ints
 from vstent.units import place
 
 FAR_MM: Final = 1.5
@@ -73,18 +73,13 @@ def cut_along(vessel: Vessel, neck_mm: Floats) -> Drawn:
     level = _level_mm(vessel, cut, RIBBON_EDGES * edge_mm)
     sac, artery = (triangles.clip(lumen.vertices_mm, lumen.faces, side * level)[:2] for side in (1.0, -1.0))
     neck = np.where((vessel.closed.signed_distance(even) < 0)[:, None], even, cut)
-    return Drawn(*sac, Surface(*artery), _bulge(vessel, level < 0), neck, cut)
-
-
-def _bulge(vessel: Vessel, is_sac: Bools) -> Bulge:
-    """Return the part of a sac's wall, vertices (n,), that does not belong to a branch according to the centerlines."""
-    tubes = tubes_of(vessel.centerlines)
-    height, sphere = tubes.height_mm(vessel.lumen.vertices_mm)
+    # Wall that belongs to a branch according to the centerlines does not bulge.
+    tubes, is_sac = tubes_of(vessel.centerlines), level < 0
+    height, sphere = tubes.height_mm(lumen.vertices_mm)
     height = np.where(is_sac, height, -np.inf)
-    dome = vessel.lumen.vertices_mm[height.argmax()]
-    found = bulge_at(vessel.lumen, height, height > FLANK * tubes.radius_mm[sphere], dome)
-    points = vessel.lumen.vertices_mm[is_sac]
-    return found or Bulge(points, points, dome, float(height.max()))
+    dome, points = lumen.vertices_mm[height.argmax()], lumen.vertices_mm[is_sac]
+    bulge = bulge_at(lumen, height, height > FLANK * tubes.radius_mm[sphere], dome)
+    return Drawn(*sac, Surface(*artery), bulge or Bulge(points, points, dome, float(height.max())), neck, cut)
 
 
 def _level_mm(vessel: Vessel, curve_mm: Floats, reach_mm: float) -> Floats:
@@ -105,13 +100,8 @@ def _level_mm(vessel: Vessel, curve_mm: Floats, reach_mm: float) -> Floats:
     is_crossed = np.zeros(len(edges), dtype=bool)
     is_crossed[near] = ribbon.crosses(ends[near, 0], ends[near, 1])
     label = triangles.joined(edges[~is_crossed], len(lumen.vertices_mm))
-    return np.where(_is_sac(vessel, label), -distance, distance)
-
-
-def _is_sac(vessel: Vessel, label: Ints) -> Bools:
-    """Return whether each vertex (n,) is in the largest part, by label (n,), that is separated from the inlet."""
-    points = vessel.lumen.vertices_mm
-    at_end = [label[int(np.linalg.norm(points - end.center_mm, axis=1).argmin())] for end in vessel.openings]
+    at_end = [label[int(np.linalg.norm(lumen.vertices_mm - end.center_mm, axis=1).argmin())] for end in vessel.openings]
+    # The sac is the largest part that is separated from the inlet.
     count = np.bincount(label)
     count[at_end[0]] = 0
     sac = int(count.argmax())
@@ -121,4 +111,4 @@ def _is_sac(vessel: Vessel, label: Ints) -> Bools:
         )
     if sac in at_end[1:] and at_end[0] not in at_end[1:]:
         raise InputError("the neck runs around the artery itself: draw it around the mouth of the sac only")
-    return np.asarray(label == sac)
+    return np.where(label == sac, -distance, distance)

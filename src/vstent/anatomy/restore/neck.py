@@ -204,7 +204,17 @@ def skirt(flank: Flank, artery: Artery, lumen: Surface, *, n_rings: int) -> Floa
     n = max(32, round(8 * place[-1] / low_mm))
     even = curves.interpolate(place, np.concatenate([rim_mm, rim_mm[:1]]), place[-1] * np.arange(n) / n)
     n_waves = place[-1] / (DETAIL * low_mm)
-    bend = curves.lowpass(_parabolas(_rise(flank, even, low_mm)), n_waves)
+    # Points up the flank from its rim, each the nearest one on the next contour line, and parabolas through them.
+    high_mm = min(BAND * low_mm, low_mm + BAND_OF_HEIGHT * (float(flank.height_mm.max()) - low_mm))
+    points = [even]
+    for height_mm in np.linspace(low_mm, high_mm, N_LEVELS)[1:]:
+        line_mm = flank.isoline(float(height_mm))
+        points.append(line_mm[cKDTree(line_mm).query(points[-1])[1]])
+    rise = np.stack(points)
+    steps = np.linalg.norm(np.diff(rise, axis=0), axis=2)
+    along = np.concatenate([np.zeros((1, n)), np.cumsum(steps, axis=0)]).T
+    parabolas = np.asarray(np.linalg.pinv(along[..., None] ** np.arange(3)) @ rise.transpose(1, 0, 2))
+    bend = curves.lowpass(parabolas, n_waves)
     # A sac is convex. A concave flank is the flare of its mouth, and would lead the extrapolation astray.
     outward = np.cross(np.roll(bend[:, 0], -1, axis=0) - np.roll(bend[:, 0], 1, axis=0), bend[:, 1])
     outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-12)
@@ -242,23 +252,6 @@ def _sharpest_rad(ring_mm: Floats, length_mm: float) -> float:
     before = np.roll(chord, 4, axis=0)
     size = np.maximum(np.linalg.norm(chord, axis=1) * np.linalg.norm(before, axis=1), 1e-12)
     return float(np.arccos(np.clip(np.einsum("nd,nd->n", chord, before) / size, -1.0, 1.0)).max())
-
-
-def _rise(flank: Flank, starts_mm: Floats, low_mm: float) -> Floats:
-    """Return points (levels, n, 3) up the flank from its rim, each the nearest one on the next contour line."""
-    high_mm = min(BAND * low_mm, low_mm + BAND_OF_HEIGHT * (float(flank.height_mm.max()) - low_mm))
-    points = [starts_mm]
-    for height_mm in np.linspace(low_mm, high_mm, N_LEVELS)[1:]:
-        line_mm = flank.isoline(float(height_mm))
-        points.append(line_mm[cKDTree(line_mm).query(points[-1])[1]])
-    return np.stack(points)
-
-
-def _parabolas(points_mm: Floats) -> Floats:
-    """Return least-squares coefficients (n, 3, 3) of 1, t, t^2 of lines (levels, n, 3), with t the arc length."""
-    steps = np.linalg.norm(np.diff(points_mm, axis=0), axis=2)
-    length = np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)]).T
-    return np.asarray(np.linalg.pinv(length[..., None] ** np.arange(3)) @ points_mm.transpose(1, 0, 2))
 
 
 def _length_to_neck(bend: Floats, reach_mm: float, artery: Artery, lumen: Surface) -> Floats:

@@ -159,10 +159,14 @@ def _level(lumen: Surface, height_mm: Floats, low_mm: float) -> Floats:
     # The border moves by at most low_mm squared times its curvature. Spikes narrower than low_mm vanish where the
     # height hardly exceeds it.
     excess = height_mm - low_mm
-    member = np.flatnonzero(_near_border(lumen, excess, SETTLING * low_mm))
+    is_above = excess[lumen.faces] > 0
+    border = lumen.vertices_mm[np.unique(lumen.faces[is_above.any(axis=1) & ~is_above.all(axis=1)])]
     level = -excess
-    if not len(member):
+    if not len(border):
         return level
+    reach_mm = SETTLING * low_mm
+    is_near = np.asarray(cKDTree(border).query(lumen.vertices_mm, distance_upper_bound=reach_mm)[0]) < reach_mm
+    member = np.flatnonzero(is_near)
     number = np.full(len(height_mm), -1)
     number[member] = np.arange(len(member))
     faces = number[lumen.faces[(number[lumen.faces] >= 0).all(axis=1)]]
@@ -171,16 +175,6 @@ def _level(lumen: Surface, height_mm: Floats, low_mm: float) -> Floats:
     gain = np.clip(excess[member], -low_mm, low_mm) / low_mm**2
     level[member] = low_mm * region(lumen.vertices_mm[member], faces, gain, edge, low_mm)
     return level
-
-
-def _near_border(lumen: Surface, excess: Floats, reach_mm: float) -> Bools:
-    """Return whether each vertex (n,) is within `reach_mm` of where the excess (n,) changes sign."""
-    is_above = excess[lumen.faces] > 0
-    crossed = is_above.any(axis=1) & ~is_above.all(axis=1)
-    border = lumen.vertices_mm[np.unique(lumen.faces[crossed])]
-    if not len(border):
-        return np.zeros(len(excess), dtype=bool)
-    return np.asarray(cKDTree(border).query(lumen.vertices_mm, distance_upper_bound=reach_mm)[0]) < reach_mm
 
 
 def _artery(vessel: Vessel, landing: Landing, lines: Sequence[Centerline], bulge: Bulge) -> Artery:
@@ -200,16 +194,12 @@ def _artery(vessel: Vessel, landing: Landing, lines: Sequence[Centerline], bulge
             landings.append(side)
             place, _ = curves.project(side.points_mm, line.points_mm)
             is_branch &= (place <= 0) | (place >= curves.arc_length(side.points_mm)[-1])
-        proper += [Centerline(line.points_mm[run], line.inscribed_radius_mm[run]) for run in _runs(is_branch)]
+        runs = np.flatnonzero(np.diff(np.concatenate([[False], is_branch, [False]]).astype(int))).reshape(-1, 2)
+        slices = [slice(first, last) for first, last in runs if last - first > 1]
+        proper += [Centerline(line.points_mm[run], line.inscribed_radius_mm[run]) for run in slices]
     branches = tubes_of(proper)
     along_mm = np.concatenate([np.zeros(0), *(line.abscissa_mm for line in proper)])
     return Artery(tuple(landings), branches, apart_mm(landings, branches, along_mm, _low_mm(vessel, landing, bulge)))
-
-
-def _runs(member: Bools) -> list[slice]:
-    """Return the slices of consecutive members (n,), each with at least two."""
-    change = np.flatnonzero(np.diff(np.concatenate([[False], member, [False]]).astype(int)))
-    return [slice(first, last) for first, last in change.reshape(-1, 2) if last - first > 1]
 
 
 def _beside(lumen: Surface, landing: Landing, line: Centerline, bulge: Bulge) -> Landing | None:
@@ -250,16 +240,11 @@ def _into_parent(landing: Landing, line: Centerline, bulge: Bulge) -> Centerline
         one, other = line.points_mm[away], landing.points_mm[parent]
         chords = one[-1] - one[0], other[-1] - other[0]
         if chords[0] @ chords[1] > TURNED_BACK * float(np.linalg.norm(chords[0]) * np.linalg.norm(chords[1])):
+            points = np.concatenate([one, other])
             widths = np.concatenate([line.inscribed_radius_mm[away], landing.section_radius_mm[parent]])
-            return _evenly(np.concatenate([one, other]), widths)
+            even, along = curves.resample(points, COURSE_STEP_MM), curves.arc_length(points)
+            return Centerline(even, np.interp(np.linspace(0.0, along[-1], len(even)), along, widths))
     return None
-
-
-def _evenly(points_mm: Floats, radius_mm: Floats) -> Centerline:
-    """Return a centerline with evenly spaced points through points (n, 3) with radii (n,)."""
-    even = curves.resample(points_mm, COURSE_STEP_MM)
-    share = np.linspace(0.0, curves.arc_length(points_mm)[-1], len(even))
-    return Centerline(even, np.interp(share, curves.arc_length(points_mm), radius_mm))
 
 
 def _neck(artery: Artery, rim_mm: Floats) -> Surface:
