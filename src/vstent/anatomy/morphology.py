@@ -8,7 +8,7 @@ from scipy.spatial.distance import pdist
 
 from vstent.anatomy.landing_zones import landing_diameters_mm, neck_span_mm
 from vstent.anatomy.shape import beyond_plane, shape_indices
-from vstent.geometry.vessel import Anatomy, Aneurysm, Centerline, NeckPlane
+from vstent.geometry.vessel import Anatomy, Aneurysm, Centerline
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Floats
 
@@ -109,7 +109,7 @@ def _course(anatomy: Anatomy) -> Measures:
 
 def _sac(aneurysm: Aneurysm, axis: Centerline, parent_diameter_mm: float) -> Measures:
     """Return the measures of a sac and its neck."""
-    plane, dome_mm = _plane_of(aneurysm), aneurysm.sac.vertices_mm
+    plane, dome_mm = aneurysm.plane or aneurysm.mean_plane, aneurysm.sac.vertices_mm
     center_mm, normal = plane.center_mm, plane.normal
     height_mm = float(((dome_mm - center_mm) @ normal).max())
     reach_mm = float(np.linalg.norm(dome_mm - center_mm, axis=1).max())
@@ -140,17 +140,6 @@ def _sac(aneurysm: Aneurysm, axis: Centerline, parent_diameter_mm: float) -> Mea
     elif beyond.section_mm2 > PARTED * plane.area_mm2:
         found["neck_plane_area_mm2"] = beyond.section_mm2
     return found
-
-
-def _plane_of(aneurysm: Aneurysm) -> NeckPlane:
-    """Return the neck plane; the mean plane of the neck curve where no plane separates the sac from all arteries."""
-    if aneurysm.plane is not None:
-        return aneurysm.plane
-    rim_mm = aneurysm.neck_mm
-    vector_mm2 = triangles.polygon_area_vector(rim_mm)
-    area_mm2 = float(np.linalg.norm(vector_mm2))
-    inward = aneurysm.sac.vertices_mm.mean(axis=0) - triangles.polygon_centroid(rim_mm)
-    return NeckPlane(vector_mm2 / area_mm2 * np.sign(inward @ vector_mm2), rim_mm, (area_mm2, area_mm2))
 
 
 def _inflow_angle(

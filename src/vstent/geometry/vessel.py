@@ -192,6 +192,14 @@ class Aneurysm:
     def __post_init__(self) -> None:
         freeze(self, "neck_mm", np.float64, (-1, 3))
 
+    @cached_property
+    def mean_plane(self) -> NeckPlane:
+        """Mean plane of the neck curve; its rim is that curve."""
+        vector_mm2 = triangles.polygon_area_vector(self.neck_mm)
+        area_mm2 = float(np.linalg.norm(vector_mm2))
+        inward = self.sac.vertices_mm.mean(axis=0) - triangles.polygon_centroid(self.neck_mm)
+        return NeckPlane(vector_mm2 / area_mm2 * np.sign(inward @ vector_mm2), self.neck_mm, (area_mm2, area_mm2))
+
 
 @dataclass(frozen=True, eq=False)
 class Candidate:

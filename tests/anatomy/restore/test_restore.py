@@ -24,7 +24,7 @@ from vstent.anatomy.morphology import morphology
 from vstent.anatomy.repair import repair
 from vstent.anatomy.restore.neck import Flank, unblurred
 from vstent.anatomy.restore.restore import restore
-from vstent.anatomy.restore.sac import _is_island
+from vstent.anatomy.restore.sac import is_island
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
 from vstent.errors import InputError
@@ -187,9 +187,9 @@ def test_low_wall_apart_from_every_opening_is_where_the_sac_touches_an_artery() 
     lumen = phantoms.phantom_surface(tube(length_mm=10))
     x, _, z = lumen.vertices_mm.T
     touching, artery = (np.abs(z - 6) < 1) & (x > 1), z < 3
-    np.testing.assert_array_equal(_is_island(lumen, touching | artery), touching)
+    np.testing.assert_array_equal(is_island(lumen, touching | artery), touching)
     bridge = (np.abs(z - 4) < 2.5) & (np.abs(x - 1.5) < 0.5)
-    assert not _is_island(lumen, touching | artery | bridge).any()
+    assert not is_island(lumen, touching | artery | bridge).any()
 
 
 @cache

@@ -93,13 +93,7 @@ class Mouth(NamedTuple):
 
 
 def fit_axis(lumen: Surface, line: Centerline, mouths: Sequence[Mouth] = ()) -> Tube:
-    """Fit axis and radius of the artery along a centerline, ignoring sacs and branches.
-
-    Raises
-    ------
-    VesselError
-        When no tube fits the wall along the centerline.
-    """
+    """Fit axis and radius of the artery along a centerline, ignoring sacs and branches."""
     points = curves.resample(line.points_mm, STEP_MM)
     abscissa = curves.arc_length(points)
     parent = parent_radius_mm(line.abscissa_mm, line.inscribed_radius_mm)
@@ -112,19 +106,14 @@ def fit_axis(lumen: Surface, line: Centerline, mouths: Sequence[Mouth] = ()) -> 
         weight = np.clip((none - excess) / (none - full), 0.0, 1.0)
         weight = np.where(necks.is_sacward, 0.0, weight)
         tube = _fit(np.where(weight > 0, rho, 0.0), weight, necks, line.points_mm)
-        _refuse_astray(tube, line)
+        away_mm = np.linalg.norm(_toward(line.points_mm, tube.points_mm), axis=1)
+        worst = int(np.argmax(away_mm))
+        if away_mm[worst] > ASTRAY * line.inscribed_radius_mm.max():
+            raise VesselError(
+                f"no artery fits the wall: its axis would run {away_mm[worst]:.0f} mm from the centerline, to "
+                f"{place(tube.points_mm[worst])}: give a longer piece of the vessel, or one with a complete wall"
+            )
     return tube
-
-
-def _refuse_astray(tube: Tube, line: Centerline) -> None:
-    """Raise a VesselError where the axis of a tube runs too far from its centerline."""
-    away_mm = np.linalg.norm(_toward(line.points_mm, tube.points_mm), axis=1)
-    worst = int(np.argmax(away_mm))
-    if away_mm[worst] > ASTRAY * line.inscribed_radius_mm.max():
-        raise VesselError(
-            f"no artery fits the wall: its axis would run {away_mm[worst]:.0f} mm from the centerline, to "
-            f"{place(tube.points_mm[worst])}: give a longer piece of the vessel, or one with a complete wall"
-        )
 
 
 class _Necks(NamedTuple):
@@ -141,43 +130,33 @@ class _Necks(NamedTuple):
     necks."""
 
 
-class _Neck(NamedTuple):
-    """One neck on an artery."""
-
-    is_under: Bools
-    """(n,) whether a section is under the neck or its flare."""
-    diameter_mm: float
-    """Diameter of the artery under the neck."""
-    is_sacward: Bools
-    """(n, rays) whether a ray points into the neck."""
-    across: Floats
-    """(n, 2) unit vector in the section perpendicular to the sac's direction; zero elsewhere."""
-
-
 def _across_necks(tube: Tube, mouths: Sequence[Mouth]) -> _Necks:
     """Return the necks of all mouths, with the artery interpolated across them from its healthy sections."""
     n = len(tube.points_mm)
     healthy, sacward, across = np.ones(n, dtype=bool), np.zeros((n, N_RAYS), dtype=bool), np.zeros((n, 2))
-    necks = [neck for mouth in mouths if (neck := _neck(tube, mouth))]
-    for neck in necks:
-        healthy &= ~neck.is_under
-        sacward |= neck.is_sacward
-        across = np.where(neck.across.any(axis=1, keepdims=True), neck.across, across)
+    necks = []
+    for mouth in mouths:
+        if neck := _neck(tube, mouth):
+            is_under, diameter_mm, is_sacward, square = neck
+            necks.append((is_under, diameter_mm))
+            healthy &= ~is_under
+            sacward |= is_sacward
+            across = np.where(square.any(axis=1, keepdims=True), square, across)
     if not healthy.any():
         return _Necks(tube, np.zeros(n), sacward, across)
     trust, telling = np.where(healthy, 0.0, NECK_TRUST * N_RAYS), healthy
-    for neck in necks:
-        throat = _throat_beside(tube, neck, healthy)
+    for is_under, diameter_mm in necks:
+        throat = _throat_beside(tube, is_under, diameter_mm, healthy)
         telling = telling & ~throat
-        trust = np.where(neck.is_under & throat.any(), THROAT_TRUST * N_RAYS, trust)
+        trust = np.where(is_under & throat.any(), THROAT_TRUST * N_RAYS, trust)
     abscissa = curves.arc_length(tube.points_mm)
     between = curves.interpolate(abscissa[telling], tube.oval_mm[telling], abscissa)
     oval = np.where(healthy[:, None], tube.oval_mm, between)
     return _Necks(Tube(tube.points_mm, oval), trust, sacward, across)
 
 
-def _neck(tube: Tube, mouth: Mouth) -> _Neck | None:
-    """Return the neck of a mouth on a tube; None where the mouth is not on it."""
+def _neck(tube: Tube, mouth: Mouth) -> tuple[Bools, float, Bools, Floats] | None:
+    """Return sections (n,) under a mouth, their diameter, rays into it and directions across it; None off the tube."""
     (points, radius), (foot_mm, inward) = (tube.points_mm, tube.radius_mm), mouth
     abscissa = curves.arc_length(points)
     place, distance = curves.project(points, foot_mm)
@@ -193,14 +172,14 @@ def _neck(tube: Tube, mouth: Mouth) -> _Neck | None:
     beside = under[:, None] & (reach > 0.5 * typical)
     square = np.einsum("nkd,nd->nk", curves.parallel_frames(points)[:, :0:-1], into) * [-1.0, 1.0]
     across = np.where(beside, square / np.maximum(np.linalg.norm(square, axis=1, keepdims=True), 1e-12), 0.0)
-    return _Neck(under, 2.0 * typical, beside & (to_sac > FAR_SIDE * reach), across)
+    return under, 2.0 * typical, beside & (to_sac > FAR_SIDE * reach), across
 
 
-def _throat_beside(tube: Tube, neck: _Neck, healthy: Bools) -> Bools:
+def _throat_beside(tube: Tube, is_under: Bools, diameter_mm: float, healthy: Bools) -> Bools:
     """Return whether each section (n,) is in a stenosis beside a neck, and so not healthy."""
     # A tapering artery, or one that is thinner beyond a fork, is not narrower there than on both sides.
-    abscissa, (first, last) = curves.arc_length(tube.points_mm), np.flatnonzero(neck.is_under)[[0, -1]]
-    reach_mm = THROAT_REACH * neck.diameter_mm
+    abscissa, (first, last) = curves.arc_length(tube.points_mm), np.flatnonzero(is_under)[[0, -1]]
+    reach_mm = THROAT_REACH * diameter_mm
     upstream = healthy & (abscissa < abscissa[first]) & (abscissa > abscissa[first] - reach_mm)
     downstream = healthy & (abscissa > abscissa[last]) & (abscissa < abscissa[last] + reach_mm)
     throat = np.zeros(len(abscissa), dtype=bool)
@@ -214,20 +193,14 @@ def _throat_beside(tube: Tube, neck: _Neck, healthy: Bools) -> Bools:
 
 
 def section_rays(lumen: Surface, points_mm: Floats, n_rays: int) -> Floats:
-    """Return the distance from axis points to the wall along the rays of their sections.
-
-    Shapes: `points_mm` (n, 3).
-    """
+    """Return the distance (n, rays) from axis points (n, 3) to the wall along the rays of their sections."""
     directions = section_directions(points_mm, n_rays)
     origins = np.repeat(points_mm, n_rays, axis=0)
     return lumen.first_hit(origins, directions.reshape(-1, 3)).reshape(len(points_mm), n_rays)
 
 
 def section_directions(points_mm: Floats, n_rays: int) -> Floats:
-    """Return the unit vectors of the rays around axis points.
-
-    Shapes: `points_mm` (n, 3).
-    """
+    """Return the unit vectors (n, rays, 3) of the rays around axis points (n, 3)."""
     frames = curves.parallel_frames(points_mm)
     angle = 2 * np.pi * np.arange(n_rays) / n_rays
     return np.cos(angle)[None, :, None] * frames[:, None, 1] + np.sin(angle)[None, :, None] * frames[:, None, 2]
@@ -251,7 +224,15 @@ def _fit(rho: Floats, weight: Floats, necks: _Necks, medial_mm: Floats) -> Tube:
     # centerline bulges into the sac, but not sideways.
     points, (n, n_rays) = necks.tube.points_mm, rho.shape
     frames = curves.parallel_frames(points)
-    normal, right = _equations(rho, weight, necks, frames, medial_mm)
+    basis = _waves(n_rays)
+    normal = np.einsum("ik,nk,jk->ijn", basis, weight, basis)
+    right = np.einsum("ik,nk,nk->in", basis, weight, rho)
+    for i, value in zip((0, 3, 4), necks.tube.oval_mm.T, strict=True):
+        normal[i, i] += necks.trust + (ROUND_TRUST * n_rays if i else 0.0)
+        right[i] += necks.trust * value
+    aside = SIDE_TRUST * n_rays * np.einsum("nk,nkd,nd->n", necks.across, frames[:, 1:], _toward(medial_mm, points))
+    right[1:3] += aside * necks.across.T
+    normal[1:3, 1:3] += SIDE_TRUST * n_rays * np.einsum("ni,nj->ijn", necks.across, necks.across)
     blocks, bent = _stiffness(necks.tube, frames, n_rays)
     for i, j in product(range(5), repeat=2):
         blocks[i][j] = blocks[i][j] + diags(normal[i, j])
@@ -259,22 +240,14 @@ def _fit(rho: Floats, weight: Floats, necks: _Necks, medial_mm: Floats) -> Tube:
     solution = spsolve(csc_matrix(bmat(blocks) + ridge), (right - bent).ravel()).reshape(5, n)
     moved = points + solution[1][:, None] * frames[:, 1] + solution[2][:, None] * frames[:, 2]
     evenly = curves.resample_evenly(moved, n)
-    return Tube(evenly, _turned(_bounded(solution[[0, 3, 4]].T), frames, curves.parallel_frames(evenly)))
-
-
-def _equations(rho: Floats, weight: Floats, necks: _Necks, frames: Floats, medial_mm: Floats) -> tuple[Floats, Floats]:
-    """Return the normal equations (5, 5, n) and right-hand sides (5, n) of every section's rays and priors."""
-    (points, oval), n_rays = necks.tube, rho.shape[1]
-    basis = _waves(n_rays)
-    normal = np.einsum("ik,nk,jk->ijn", basis, weight, basis)
-    right = np.einsum("ik,nk,nk->in", basis, weight, rho)
-    for i, value in zip((0, 3, 4), oval.T, strict=True):
-        normal[i, i] += necks.trust + (ROUND_TRUST * n_rays if i else 0.0)
-        right[i] += necks.trust * value
-    aside = SIDE_TRUST * n_rays * np.einsum("nk,nkd,nd->n", necks.across, frames[:, 1:], _toward(medial_mm, points))
-    right[1:3] += aside * necks.across.T
-    normal[1:3, 1:3] += SIDE_TRUST * n_rays * np.einsum("ni,nj->ijn", necks.across, necks.across)
-    return normal, right
+    radius = np.maximum(solution[0], 0.1)
+    most = OVAL_MOST * radius / np.maximum(np.hypot(solution[3], solution[4]), 1e-12)
+    # The ovals in the frames of the moved axis.
+    first = curves.parallel_frames(evenly)[:, 1]
+    along, across = (np.einsum("nd,nd->n", first, frames[:, k]) for k in (1, 2))
+    oval = np.minimum(most, 1.0) * solution[3:]
+    turned = (oval[0] + 1j * oval[1]) * np.exp(-2j * np.arctan2(across, along))
+    return Tube(evenly, np.stack([radius, turned.real, turned.imag], axis=1))
 
 
 def _stiffness(tube: Tube, frames: Floats, n_rays: int) -> tuple[list[list[Any]], Floats]:
@@ -292,17 +265,3 @@ def _stiffness(tube: Tube, frames: Floats, n_rays: int) -> tuple[list[list[Any]]
         for j in (1, 2):
             blocks[i][j] = blocks[i][j] + across @ axis @ diags(frames[:, j, side])
     return blocks, bent
-
-
-def _bounded(oval: Floats) -> Floats:
-    """Return ovals (n, 3) with their deviation from a circle limited by `OVAL_MOST` and radii of at least 0.1 mm."""
-    radius = np.maximum(oval[:, 0], 0.1)
-    most = OVAL_MOST * radius / np.maximum(np.hypot(oval[:, 1], oval[:, 2]), 1e-12)
-    return np.column_stack([radius, oval[:, 1:] * np.minimum(most, 1.0)[:, None]])
-
-
-def _turned(oval: Floats, frames: Floats, others: Floats) -> Floats:
-    """Return ovals (n, 3) given in frames (n, 3, 3) expressed in other frames (n, 3, 3)."""
-    along, across = (np.einsum("nd,nd->n", others[:, 1], frames[:, k]) for k in (1, 2))
-    turned = (oval[:, 1] + 1j * oval[:, 2]) * np.exp(-2j * np.arctan2(across, along))
-    return np.stack([oval[:, 0], turned.real, turned.imag], axis=1)

@@ -1,7 +1,7 @@
 """Find bulges: connected parts of the wall that rise above the tubes and may be sacs."""
 
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -62,50 +62,42 @@ class Bulge:
         return np.asarray(cKDTree(self.points_mm).query(points_mm)[0])
 
 
-class _Standing(NamedTuple):
-    """A bulge that may be a sac."""
-
-    bulge: Bulge
-    """The bulge."""
-    is_high: bool
-    """Whether it is high enough for a sac."""
-    is_wide: bool
-    """Whether it is wide enough for a sac, and not a branch that ends blind."""
-
-
 def find_bulges(lumen: Surface, tubes: Tubes, at_mm: Floats | None = None) -> list[Bulge]:
-    """Find the sacs on the lumen's wall.
-
-    Shapes: `at_mm` (3,).
-    """
-    found = _standing_out(lumen, tubes)
+    """Find the sacs on the lumen's wall, the largest first; with a point (3,), the bulge nearest to it."""
+    bulges = _all_bulges(lumen, tubes)
     if at_mm is None:
-        return _largest_first([one.bulge for one in found if one.is_wide and one.is_high])
+        return _largest_first([bulge for bulge, is_high, is_wide in bulges if is_high and is_wide])
     point = np.asarray(at_mm, dtype=np.float64)[None]
-    bulges = [one.bulge for one in found]
-    near = [b for b in bulges if float(b.distances_mm(point)[0]) < max(2.0 * b.height_mm, 1.0)]
-    return sorted(near, key=lambda bulge: float(bulge.distances_mm(point)[0]))[:1]
+    away_mm = [(float(bulge.distances_mm(point)[0]), bulge) for bulge, *_ in bulges]
+    near = [(gap_mm, bulge) for gap_mm, bulge in away_mm if gap_mm < max(2.0 * bulge.height_mm, 1.0)]
+    return [bulge for _, bulge in sorted(near, key=lambda row: row[0])[:1]]
 
 
 def flat_bulges(lumen: Surface, tubes: Tubes) -> list[Bulge]:
     """Return bulges that are as wide as sacs but too low, the largest first."""
-    found = [one.bulge for one in _standing_out(lumen, tubes) if one.is_wide and not one.is_high]
-    return _largest_first([bulge for bulge in found if bulge.height_mm > LOW_MM])
+    bulges = _all_bulges(lumen, tubes)
+    return _largest_first([b for b, is_high, is_wide in bulges if is_wide and not is_high and b.height_mm > LOW_MM])
 
 
-def _standing_out(lumen: Surface, tubes: Tubes) -> list[_Standing]:
-    """Return all bulges on the lumen's wall."""
+def _all_bulges(lumen: Surface, tubes: Tubes) -> list[tuple[Bulge, bool, bool]]:
+    """Return all bulges on the lumen's wall, whether each is high enough for a sac, and whether it is wide enough."""
     height, sphere = tubes.height_mm(lumen.vertices_mm)
     parent = tubes.radius_mm[sphere]
-    thickness = _thickness_mm(lumen)
+    # Depth of the lumen below every vertex (Shapira et al. 2008, Visual Computer 24:249, one ray).
+    inward = -lumen.vertex_normals
+    depth = lumen.first_hit(lumen.vertices_mm + 1e-3 * inward, inward)
+    thickness = np.where(np.isfinite(depth), depth, 0.0)
     found = []
     for member in _patches(lumen, height > FLANK * parent):
         typical = float(np.median(parent[member]))
-        member = _about_dome(lumen.vertices_mm[member], height[member] / typical, SHOULDER * typical, member)
+        points, is_top = lumen.vertices_mm[member], height[member] / typical > HEIGHT
+        if is_top.any():
+            member = member[cKDTree(points[is_top]).query(points)[0] <= SHOULDER * typical]
         width_mm = max(float(np.median(thickness[member])), 1e-6)
         bulge = replace(_bulge(lumen, height, member), width_mm=width_mm)
         is_high = bulge.height_mm > max(HEIGHT * typical, HEIGHT_MM)
-        found.append(_Standing(bulge, is_high, width_mm > WIDTH * typical and bulge.height_mm < LENGTH * width_mm))
+        # A bulge that is too high for its width is a branch that ends blind.
+        found.append((bulge, is_high, width_mm > WIDTH * typical and bulge.height_mm < LENGTH * width_mm))
     return found
 
 
@@ -114,19 +106,8 @@ def _largest_first(bulges: list[Bulge]) -> list[Bulge]:
     return sorted(bulges, key=lambda bulge: -min(bulge.height_mm, bulge.width_mm))
 
 
-def _about_dome(points_mm: Floats, rise: Floats, reach_mm: float, member: Ints) -> Ints:
-    """Return the members of a patch within `reach_mm` of vertices as high as a sac; all where none is that high."""
-    is_high = rise > HEIGHT
-    if not is_high.any():
-        return member
-    return np.asarray(member[cKDTree(points_mm[is_high]).query(points_mm)[0] <= reach_mm])
-
-
 def bulge_at(lumen: Surface, height_mm: Floats, is_out: Bools, dome_mm: Floats) -> Bulge | None:
-    """Return the connected part of the wall that contains a dome.
-
-    Shapes: `height_mm` (n,), `is_out` (n,), `dome_mm` (3,).
-    """
+    """Return the connected part of the wall, of heights (n,), where `is_out` (n,) holds that contains a dome (3,)."""
     dome = int(np.argmin(np.linalg.norm(lumen.vertices_mm - dome_mm, axis=1)))
     patches = [member for member in _patches(lumen, is_out) if dome in member]
     return _bulge(lumen, height_mm, patches[0]) if patches else None
@@ -150,10 +131,3 @@ def _patches(lumen: Surface, is_out: Bools) -> list[Ints]:
     label = triangles.joined(edges, len(is_out))
     count = np.bincount(label[is_out], minlength=label.max() + 1)
     return [np.flatnonzero(is_out & (label == k)) for k in np.flatnonzero(count >= 5)]
-
-
-def _thickness_mm(lumen: Surface) -> Floats:
-    """Return the depth (n,) of the lumen below every vertex (Shapira et al. 2008, Visual Computer 24:249, one ray)."""
-    inward = -lumen.vertex_normals
-    depth = lumen.first_hit(lumen.vertices_mm + 1e-3 * inward, inward)
-    return np.where(np.isfinite(depth), depth, 0.0)

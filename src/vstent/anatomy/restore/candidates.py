@@ -32,7 +32,11 @@ FEWEST_VOXELS: Final = 4.0
 
 def classified(vessel: Vessel, aneurysm: Aneurysm, artery_diameter_mm: float) -> Candidate:
     """Classify a sac that was cut off."""
-    neck_mm, widths_mm, reach_mm = _profile(aneurysm)
+    plane, dome_mm = aneurysm.mean_plane, aneurysm.sac.vertices_mm
+    neck_mm = 2 * float(np.sqrt(plane.area_mm2 / np.pi))
+    reach_mm = float(curves.lengths(dome_mm - plane.center_mm).max())
+    height_mm = (dome_mm - plane.center_mm) @ plane.normal
+    widths_mm = np.array([_width_mm(aneurysm, fraction * height_mm.max() - height_mm) for fraction in HEIGHTS])
     widest_mm = float(widths_mm.max())
     sphere_mm = float(np.cbrt(6 * abs(aneurysm.sac.volume_mm3) / np.pi))
     slenderness = reach_mm / max(widest_mm, 1e-9)
@@ -51,20 +55,7 @@ def classified(vessel: Vessel, aneurysm: Aneurysm, artery_diameter_mm: float) ->
         kind, reasons = "bleb", [f"it is small beside the artery of {artery_diameter_mm:.1f} mm", size]
     if vessel.voxel_mm is not None and kind != "artifact":
         reasons.append(f"{counted(round(widest_mm / vessel.voxel_mm), 'voxel')} across")
-    return Candidate(kind, _dome_mm(aneurysm), tuple(reasons))
-
-
-def _profile(aneurysm: Aneurysm) -> tuple[float, Floats, float]:
-    """Return the neck's width, the widths (12,) of the sac above it, and its largest distance from the neck, in mm."""
-    # A width is the diameter of the circle with the area of the section parallel to the neck plane.
-    rim_mm, dome_mm = aneurysm.neck_mm, aneurysm.sac.vertices_mm
-    center_mm, vector = triangles.polygon_centroid(rim_mm), triangles.polygon_area_vector(rim_mm)
-    area_mm2 = float(np.linalg.norm(vector))
-    normal = vector / area_mm2 * np.sign((dome_mm.mean(axis=0) - center_mm) @ vector)
-    height_mm = (dome_mm - center_mm) @ normal
-    widths = [_width_mm(aneurysm, fraction * height_mm.max() - height_mm) for fraction in HEIGHTS]
-    reach_mm = float(curves.lengths(dome_mm - center_mm).max())
-    return 2 * float(np.sqrt(area_mm2 / np.pi)), np.array(widths), reach_mm
+    return Candidate(kind, dome_mm.mean(axis=0), tuple(reasons))
 
 
 def _width_mm(aneurysm: Aneurysm, below_mm: Floats) -> float:
@@ -78,8 +69,3 @@ def _width_mm(aneurysm: Aneurysm, below_mm: Floats) -> float:
 def _tapers(widths_mm: Floats) -> bool:
     """Return whether a sac becomes narrower from its base to its top."""
     return bool((np.diff(widths_mm) < 0.05 * widths_mm.max()).all() and widths_mm.argmax() <= len(widths_mm) // 4)
-
-
-def _dome_mm(aneurysm: Aneurysm) -> Floats:
-    """Return the mean point (3,) of the sac, by which it can be chosen."""
-    return np.asarray(aneurysm.sac.vertices_mm.mean(axis=0))

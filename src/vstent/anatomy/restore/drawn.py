@@ -10,7 +10,7 @@ from vstent.errors import InputError
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Vessel
 from vstent.kernels import curves, triangles
-from vstent.kernels.arrays import Bools, Floats, Ints
+from vstent.kernels.arrays import Floats, Ints
 from vstent.units import place
 
 FAR_MM: Final = 1.5
@@ -51,76 +51,48 @@ class Drawn(NamedTuple):
 
 
 def cut_along(vessel: Vessel, neck_mm: Floats) -> Drawn:
-    """Cut the wall along a neck drawn by hand.
-
-    Shapes: `neck_mm` (k, 3).
-
-    Raises
-    ------
-    InputError
-        When `neck_mm` is not a curve, is too far from the wall, separates nothing from it, or runs around the artery.
-    """
+    """Cut the wall along a neck (k, 3) drawn by hand; an InputError says what is wrong with the neck."""
     given = np.asarray(neck_mm, dtype=np.float64)
     if given.ndim != 2 or given.shape[1] != 3 or len(given) < 3 or not np.isfinite(given).all():
         raise InputError(
             "the neck is not a closed curve: give at least three points with three coordinates each, in mm"
         )
     lumen = vessel.lumen
-    edge_mm = _edge_mm(lumen)
+    corners = lumen.corners_mm
+    edge_mm = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
     ring = np.concatenate([given, given[:1]])
     n = max(32, round(float(curves.arc_length(ring)[-1]) / (STEP_EDGES * edge_mm)))
     even = curves.resample_evenly(ring, n + 1)[:-1]
-    cut = _on_wall(lumen, even)
+    cut, off_mm, _ = lumen.closest(even)
+    worst = int(off_mm.argmax())
+    if off_mm[worst] > FAR_MM:
+        raise InputError(
+            f"the neck is {off_mm[worst]:.1f} mm from the wall at {place(even[worst])}: draw it within "
+            f"{FAR_MM:g} mm of the wall"
+        )
     level = _level_mm(vessel, cut, RIBBON_EDGES * edge_mm)
     sac, artery = (triangles.clip(lumen.vertices_mm, lumen.faces, side * level)[:2] for side in (1.0, -1.0))
     neck = np.where((vessel.closed.signed_distance(even) < 0)[:, None], even, cut)
-    return Drawn(*sac, Surface(*artery), _bulge(vessel, level < 0), neck, cut)
-
-
-def _edge_mm(lumen: Surface) -> float:
-    """Return the median edge length of the mesh in mm."""
-    corners = lumen.corners_mm
-    return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
-
-
-def _on_wall(lumen: Surface, curve_mm: Floats) -> Floats:
-    """Return the points (n, 3) of the wall nearest to a curve (n, 3)."""
-    points, distance, _ = lumen.closest(curve_mm)
-    worst = int(distance.argmax())
-    if distance[worst] > FAR_MM:
-        raise InputError(
-            f"the neck is {distance[worst]:.1f} mm from the wall at {place(curve_mm[worst])}: draw it within "
-            f"{FAR_MM:g} mm of the wall"
-        )
-    return points
-
-
-def _bulge(vessel: Vessel, is_sac: Bools) -> Bulge:
-    """Return the part of a sac's wall, vertices (n,), that does not belong to a branch according to the centerlines."""
-    tubes = tubes_of(vessel.centerlines)
-    height, sphere = tubes.height_mm(vessel.lumen.vertices_mm)
+    # Wall that belongs to a branch according to the centerlines does not bulge.
+    tubes, is_sac = tubes_of(vessel.centerlines), level < 0
+    height, sphere = tubes.height_mm(lumen.vertices_mm)
     height = np.where(is_sac, height, -np.inf)
-    dome = vessel.lumen.vertices_mm[height.argmax()]
-    found = bulge_at(vessel.lumen, height, height > FLANK * tubes.radius_mm[sphere], dome)
-    points = vessel.lumen.vertices_mm[is_sac]
-    return found or Bulge(points, points, dome, float(height.max()))
-
-
-def _ribbon(lumen: Surface, curve_mm: Floats, reach_mm: float) -> Surface:
-    """Return a band perpendicular to the wall along a closed curve (n, 3) on it."""
-    normals = lumen.normals[lumen.closest(curve_mm)[2]]
-    n_waves = triangles.perimeter(curve_mm) / (4.0 * reach_mm)
-    across = reach_mm * curves.lowpass(normals, n_waves)
-    n = len(curve_mm)
-    here, there = np.arange(n), (np.arange(n) + 1) % n
-    faces = [np.stack([here, there, n + there], axis=1), np.stack([here, n + there, n + here], axis=1)]
-    return Surface(np.concatenate([curve_mm - across, curve_mm + across]), np.concatenate(faces))
+    dome, points = lumen.vertices_mm[height.argmax()], lumen.vertices_mm[is_sac]
+    bulge = bulge_at(lumen, height, height > FLANK * tubes.radius_mm[sphere], dome)
+    return Drawn(*sac, Surface(*artery), bulge or Bulge(points, points, dome, float(height.max())), neck, cut)
 
 
 def _level_mm(vessel: Vessel, curve_mm: Floats, reach_mm: float) -> Floats:
     """Return the distance (n,) of the wall's vertices from the curve (k, 3), in mm; negative on the sac's side."""
     lumen = vessel.lumen
-    ribbon = _ribbon(lumen, curve_mm, reach_mm)
+    # A ribbon perpendicular to the wall along the curve.
+    across = reach_mm * curves.lowpass(
+        lumen.normals[lumen.closest(curve_mm)[2]], triangles.perimeter(curve_mm) / (4.0 * reach_mm)
+    )
+    n = len(curve_mm)
+    here, there = np.arange(n), (np.arange(n) + 1) % n
+    strips = [np.stack([here, there, n + there], axis=1), np.stack([here, n + there, n + here], axis=1)]
+    ribbon = Surface(np.concatenate([curve_mm - across, curve_mm + across]), np.concatenate(strips))
     edges = triangles.directed_edges(lumen.faces)
     ends = lumen.vertices_mm[edges]
     distance = ribbon.closest(lumen.vertices_mm)[1]
@@ -128,13 +100,8 @@ def _level_mm(vessel: Vessel, curve_mm: Floats, reach_mm: float) -> Floats:
     is_crossed = np.zeros(len(edges), dtype=bool)
     is_crossed[near] = ribbon.crosses(ends[near, 0], ends[near, 1])
     label = triangles.joined(edges[~is_crossed], len(lumen.vertices_mm))
-    return np.where(_is_sac(vessel, label), -distance, distance)
-
-
-def _is_sac(vessel: Vessel, label: Ints) -> Bools:
-    """Return whether each vertex (n,) is in the largest part, by label (n,), that is separated from the inlet."""
-    points = vessel.lumen.vertices_mm
-    at_end = [label[int(np.linalg.norm(points - end.center_mm, axis=1).argmin())] for end in vessel.openings]
+    at_end = [label[int(np.linalg.norm(lumen.vertices_mm - end.center_mm, axis=1).argmin())] for end in vessel.openings]
+    # The sac is the largest part that is separated from the inlet.
     count = np.bincount(label)
     count[at_end[0]] = 0
     sac = int(count.argmax())
@@ -144,4 +111,4 @@ def _is_sac(vessel: Vessel, label: Ints) -> Bools:
         )
     if sac in at_end[1:] and at_end[0] not in at_end[1:]:
         raise InputError("the neck runs around the artery itself: draw it around the mouth of the sac only")
-    return np.asarray(label == sac)
+    return np.where(label == sac, -distance, distance)

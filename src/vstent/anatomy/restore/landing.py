@@ -7,13 +7,13 @@ the surrounding wall (a thin plate on the (s, theta) grid). Elsewhere the wall i
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Final
 
 import numpy as np
 from scipy.linalg import solveh_banded
 from scipy.ndimage import binary_dilation, binary_propagation, map_coordinates
-from scipy.sparse import csc_matrix, diags, eye, kron
+from scipy.sparse import csc_matrix, diags, eye, kron, triu
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
@@ -123,8 +123,12 @@ def close_landing(lumen: Surface, tube: Tube, own: Surface | None = None) -> Lan
     scale = float(np.median(tube.radius_mm))
     baseline = _baseline(wall, has_wall, radius, scale)
     out = (wall - baseline) / radius
-    is_out = binary_propagation(_around(out > OUT), mask=_around(~has_wall | (out > FLARE)))
-    restored = _core(_dilated(is_out | _around(~has_wall), scale))
+    # Three copies side by side connect patches across the seam of the ring.
+    thrice = partial(np.tile, reps=(1, 3))
+    is_out = binary_propagation(thrice(out > OUT), mask=thrice(~has_wall | (out > FLARE))) | thrice(~has_wall)
+    along, around = (max(1, round(MARGIN_MM / step_mm)) for step_mm in (STEP_MM, 2 * np.pi * scale / N_RAYS))
+    margin = np.ones((2 * along + 1, 2 * around + 1), dtype=bool)
+    restored = np.asarray(binary_dilation(is_out, margin)[:, N_RAYS : 2 * N_RAYS])
     return Landing(tube.points_mm, oval + _closed(wall, restored, baseline, scale), restored)
 
 
@@ -133,12 +137,16 @@ def _baseline(wall: Floats, has_wall: Bools, radius: Floats, scale_mm: float) ->
     # The baseline has no waves shorter than three radii, so half the grid resolves it at an eighth of the run time.
     fine, wall, has_wall, radius = wall, wall[::2, ::2], has_wall[::2, ::2], radius[::2, ::2]
     stiffness = _thin_plate(wall.shape[0], wall.shape[1], scale_mm / (2 * STEP_MM))
-    baseline = radius
+    baseline, bandwidth = radius, 2 * wall.shape[1]
     for _ in range(N_PASSES):
         out = (wall - baseline) / radius
         weight = np.where(has_wall, 1.0 / (1.0 + np.maximum(out / FLARE, 0.0) ** 4), 0.0)
-        system = csc_matrix(diags((weight + PRIOR).ravel()) + stiffness)
-        baseline = _solve(system, (weight * wall + PRIOR * radius).ravel(), 2 * wall.shape[1]).reshape(wall.shape)
+        system = diags((weight + PRIOR).ravel()) + stiffness
+        upper = triu(system)
+        band = np.zeros((bandwidth + 1, wall.size))
+        band[bandwidth + upper.row - upper.col, upper.col] = upper.data
+        right = (weight * wall + PRIOR * radius).ravel()
+        baseline = solveh_banded(band, right, check_finite=False).reshape(wall.shape)
     grid = np.meshgrid(np.arange(fine.shape[0]) / 2, np.arange(fine.shape[1]) / 2, indexing="ij")
     wrapped = np.concatenate([baseline, baseline[:, :1]], axis=1)
     return np.asarray(map_coordinates(wrapped, grid, order=1, mode="nearest"))
@@ -152,23 +160,9 @@ def _closed(wall: Floats, restored: Bools, baseline: Floats, scale_mm: float) ->
     system = csc_matrix(PRIOR * eye(wall.size) + _thin_plate(wall.shape[0], wall.shape[1], scale_mm / STEP_MM))[unknown]
     known = np.where(restored, 0.0, wall).ravel()
     right = PRIOR * baseline.ravel()[unknown] - system @ known
-    return _with_values(wall, unknown, spsolve(csc_matrix(system[:, unknown]), right))
-
-
-def _with_values(wall: Floats, index: Ints, values: Floats) -> Floats:
-    """Return a copy of the wall with new values at flat indices."""
-    closed = wall.ravel().copy()
-    closed[index] = values
-    return closed.reshape(wall.shape)
-
-
-def _solve(system: csc_matrix, right: Floats, bandwidth: int) -> Floats:
-    """Return the solution of a symmetric positive definite banded system."""
-    upper = system.tocoo()
-    keep = upper.col >= upper.row
-    band = np.zeros((bandwidth + 1, len(right)))
-    band[bandwidth + upper.row[keep] - upper.col[keep], upper.col[keep]] = upper.data[keep]
-    return np.asarray(solveh_banded(band, right, check_finite=False))
+    closed = wall.copy()
+    closed[restored] = spsolve(csc_matrix(system[:, unknown]), right)
+    return closed
 
 
 def _thin_plate(n: int, n_rays: int, radius_steps: float) -> csc_matrix:
@@ -179,22 +173,3 @@ def _thin_plate(n: int, n_rays: int, radius_steps: float) -> csc_matrix:
     round_ = (n_rays / (2 * np.pi * 3.0)) ** 2
     plate = along**2 * kron(curves.roughness(n, 2), ring) + round_**2 * kron(eye(n), turn @ turn)
     return csc_matrix(plate + 2.0 * along * round_ * kron(curves.roughness(n, 1), turn))
-
-
-def _around(grid: Bools) -> Bools:
-    """Return three copies of the grid side by side, so that patches connect across the seam of the ring."""
-    return np.concatenate([grid] * 3, axis=1)
-
-
-def _core(tripled: Bools) -> Bools:
-    """Return the middle copy of a tripled grid."""
-    n_rays = tripled.shape[1] // 3
-    return tripled[:, n_rays : 2 * n_rays]
-
-
-def _dilated(tripled: Bools, radius_mm: float) -> Bools:
-    """Return a tripled grid with its members widened by `MARGIN_MM`."""
-    along = max(1, round(MARGIN_MM / STEP_MM))
-    ray_mm = 2 * np.pi * radius_mm / N_RAYS
-    round_ = max(1, round(MARGIN_MM / ray_mm))
-    return np.asarray(binary_dilation(tripled, np.ones((2 * along + 1, 2 * round_ + 1), dtype=bool)))

@@ -85,39 +85,30 @@ class Artery(NamedTuple):
     """(n,) height added to the lumen's wall beside each sphere of `branches`, in mm; see the function `apart_mm`."""
 
     def height_mm(self, points_mm: Floats, normals: Floats | None = None) -> Floats:
-        """Return the height (n,) of points above the walls of all arteries, in mm; negative inside.
-
-        Parameters
-        ----------
-        points_mm : (n, 3) points in mm.
-        normals : (n, 3) unit normals of the lumen's wall at the points. With them, wall that faces a branch counts as
-            higher, because it belongs to a sac beside that branch.
-        """
-        height = np.minimum(self._above(self.landings[0], points_mm), self.above_branches_mm(points_mm, normals))
+        """Return the height (n,) of points (n, 3) above the walls of all arteries, in mm; negative inside."""
+        # With the lumen's normals, wall that faces a branch counts as higher: it belongs to a sac beside that branch.
+        first = self.landings[0].solid.signed_distance(points_mm)
+        height = np.minimum(first, self.above_branches_mm(points_mm, normals))
         for side in self.landings[1:]:
             away = 0.0 if normals is None else _turned_mm(side.points_mm, side.section_radius_mm, points_mm, normals)
-            height = np.minimum(height, self._above(side, points_mm) + away)
+            height = np.minimum(height, side.solid.signed_distance(points_mm) + away)
         return height
 
     def above_branches_mm(self, points_mm: Floats, normals: Floats | None = None) -> Floats:
-        """Return the height (n,) of points above the walls of the branches alone, in mm; negative inside.
-
-        Shapes: `points_mm` (n, 3), `normals` (n, 3).
-        """
+        """Return the height (n,) of points (n, 3) above the walls of the branches alone, in mm; negative inside."""
         height, sphere = self.branches.height_mm(points_mm)
         if not len(self.branches.radius_mm):
             return height
-        height = height - BRANCH_SHARE * self.branches.radius_mm[sphere]
+        radius = self.branches.radius_mm[sphere]
+        height = height - BRANCH_SHARE * radius
         if normals is None:
             return height
-        height = height + self.apart_mm[sphere]
-        branches = self.branches.centers_mm[sphere], self.branches.radius_mm[sphere]
-        return height + _turned_mm(*branches, points_mm, normals)
+        return height + self.apart_mm[sphere] + _turned_mm(self.branches.centers_mm[sphere], radius, points_mm, normals)
 
     def onto(self, points_mm: Floats) -> Floats:
         """Move points (n, 3), in mm, onto the wall of the artery nearest to them; points at a branch stay."""
         for _ in range(len(self.landings)):
-            above = np.stack([self._above(landing, points_mm) for landing in self.landings])
+            above = np.stack([landing.solid.signed_distance(points_mm) for landing in self.landings])
             nearest = above.argmin(axis=0)
             moved = points_mm.copy()
             for k, landing in enumerate(self.landings):
@@ -126,27 +117,12 @@ class Artery(NamedTuple):
             points_mm = np.where(at_branch[:, None], points_mm, moved)
         return points_mm
 
-    @staticmethod
-    def _above(landing: Landing, points_mm: Floats) -> Floats:
-        """Return the signed distance (n,) of points (n, 3) to a landing surface, in mm."""
-        return landing.solid.signed_distance(points_mm)
-
 
 def apart_mm(landings: Sequence[Landing], branches: Tubes, along_mm: Floats, low_mm: float) -> Floats:
-    """Return the height (n,) added to the sac's wall beside branches that begin away from all arteries, in mm.
-
-    Beside an artery the flank is used only above `low_mm`, because it is extrapolated from there to the neck. The mouth
-    of a branch that arises from the sac is only capped, so a margin for the branch's own wall is enough. With the full
-    `low_mm` around such a branch, noise would decide whether it merges with a neck up to twice as far away. Beyond
-    `ROOT` radii along the branch the full `low_mm` applies, however uneven the branch's wall is.
-
-    Parameters
-    ----------
-    landings : landing surfaces of the arteries.
-    branches : n spheres along the branches.
-    along_mm : (n,) arc length of each sphere from the start of its branch, in mm.
-    low_mm : height above which the flank beside an artery is used, in mm.
-    """
+    """Return the height (n,) added to the sac's wall beside branches, spheres at `along_mm` (n,) from their start."""
+    # Beside an artery the flank is used only above low_mm, because it is extrapolated from there to the neck. The mouth
+    # of a branch that arises from the sac is only capped, so a margin for the branch's own wall is enough. With the
+    # full low_mm around such a branch, noise would decide whether it merges with a neck up to twice as far away.
     if not len(branches.radius_mm):
         return np.zeros(0)
     radius = branches.radius_mm
@@ -201,26 +177,20 @@ class Flank(NamedTuple):
 
 
 def believed_from_mm(lumen: Surface, foot_mm: Floats, most_mm: float, blur_mm: float | None) -> float:
-    """Return the height in mm above which the flank at a bulge's foot is free of blur.
-
-    Shapes: `foot_mm` (k, 3).
-    """
+    """Return the height in mm, at most `most_mm`, above which the flank at a bulge's foot (k, 3) is free of blur."""
     near = np.asarray(cKDTree(foot_mm).query(lumen.vertices_mm, distance_upper_bound=most_mm)[0]) < most_mm
     corners = lumen.corners_mm[near[lumen.faces].any(axis=1)]
     edge_mm = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
-    if blur_mm is None:
-        return min(max(UNREADABLE_MM, UNREADABLE_EDGES * edge_mm), most_mm)
-    return min(max(CLEAR * blur_mm, CLEAR_EDGES * edge_mm), most_mm)
+    clear_mm, edges = (UNREADABLE_MM, UNREADABLE_EDGES) if blur_mm is None else (CLEAR * blur_mm, CLEAR_EDGES)
+    return min(max(clear_mm, edges * edge_mm), most_mm)
 
 
 def unblurred(flank: Flank, blur_mm: float) -> Flank:
-    """Return the flank with the blur of the artery below it removed.
-
-    Both walls are assumed flat and parallel. At distance d from the flank and height h above the artery, the tissue
-    between them appears with the fraction Phi(d / s) - Phi(-h / s) of its own intensity, where s is the standard
-    deviation of the blur and Phi the standard normal distribution. The segmented wall lies where this fraction is one
-    half, at d = s Phi^-1(1/2 + Phi(-h / s)). The vertices are moved back by d.
-    """
+    """Return the flank with the blur of the artery below it removed."""
+    # Both walls are assumed flat and parallel. At distance d from the flank and height h above the artery, the tissue
+    # between them appears with the fraction Phi(d / s) - Phi(-h / s) of its own intensity, where s is the standard
+    # deviation of the blur and Phi the standard normal distribution. The segmented wall lies where this fraction is
+    # one half, at d = s Phi^-1(1/2 + Phi(-h / s)). The vertices are moved back by d.
     share = np.minimum(ndtr(-flank.height_mm / blur_mm), DEEPEST)
     normals = Surface(flank.vertices_mm, flank.faces).vertex_normals
     return flank._replace(vertices_mm=flank.vertices_mm - (blur_mm * ndtri(0.5 + share))[:, None] * normals)
@@ -234,27 +204,36 @@ def skirt(flank: Flank, artery: Artery, lumen: Surface, *, n_rings: int) -> Floa
     n = max(32, round(8 * place[-1] / low_mm))
     even = curves.interpolate(place, np.concatenate([rim_mm, rim_mm[:1]]), place[-1] * np.arange(n) / n)
     n_waves = place[-1] / (DETAIL * low_mm)
-    bend = _convex(curves.lowpass(_parabolas(_rise(flank, even, low_mm)), n_waves))
+    # Points up the flank from its rim, each the nearest one on the next contour line, and parabolas through them.
+    high_mm = min(BAND * low_mm, low_mm + BAND_OF_HEIGHT * (float(flank.height_mm.max()) - low_mm))
+    points = [even]
+    for height_mm in np.linspace(low_mm, high_mm, N_LEVELS)[1:]:
+        line_mm = flank.isoline(float(height_mm))
+        points.append(line_mm[cKDTree(line_mm).query(points[-1])[1]])
+    rise = np.stack(points)
+    steps = np.linalg.norm(np.diff(rise, axis=0), axis=2)
+    along = np.concatenate([np.zeros((1, n)), np.cumsum(steps, axis=0)]).T
+    parabolas = np.asarray(np.linalg.pinv(along[..., None] ** np.arange(3)) @ rise.transpose(1, 0, 2))
+    bend = curves.lowpass(parabolas, n_waves)
+    # A sac is convex. A concave flank is the flare of its mouth, and would lead the extrapolation astray.
+    outward = np.cross(np.roll(bend[:, 0], -1, axis=0) - np.roll(bend[:, 0], 1, axis=0), bend[:, 1])
+    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-12)
+    bend[:, 2] -= np.maximum(np.einsum("nd,nd->n", bend[:, 2], outward), 0.0)[:, None] * outward
     length = curves.lowpass(_length_to_neck(bend, REACH * low_mm, artery, lumen), n_waves)
     feet = bend[:, 0] - length[:, None] * bend[:, 1] + length[:, None] ** 2 * bend[:, 2]
     where = place[:-1] * n / place[-1]
-    neck = _nearly(artery, _between(_settled(artery, feet, low_mm, n_waves), where))
+    ring = artery.onto(feet)
+    for more in WAVES:
+        if _sharpest_rad(ring, 0.5 * low_mm) < HOOK_RAD:
+            break
+        ring = _nearly(artery, curves.lowpass(ring, more * n_waves))
+    neck = _nearly(artery, _between(ring, where))
     bend, length = _between(bend.reshape(n, -1), where).reshape(-1, 3, 3), _between(length[:, None], where)
     share = np.linspace(0.0, 1.0, n_rings + 1)[:, None, None]
     down = -share * length
     # The first ring is the rim itself. Its distance from the parabolas decays over the rings.
     rings = bend[:, 0] + down * bend[:, 1] + down**2 * bend[:, 2] + (1 - share) * (rim_mm - bend[:, 0])
     return np.asarray(rings + share * (neck - rings[-1]))
-
-
-def _settled(artery: Artery, feet_mm: Floats, low_mm: float, n_waves: float) -> Floats:
-    """Return a ring of points (n, 3) on the artery, smoothed only as much as is needed to remove its hooks."""
-    ring = artery.onto(feet_mm)
-    for more in WAVES:
-        if _sharpest_rad(ring, 0.5 * low_mm) < HOOK_RAD:
-            break
-        ring = _nearly(artery, curves.lowpass(ring, more * n_waves))
-    return ring
 
 
 def _nearly(artery: Artery, points_mm: Floats) -> Floats:
@@ -273,35 +252,6 @@ def _sharpest_rad(ring_mm: Floats, length_mm: float) -> float:
     before = np.roll(chord, 4, axis=0)
     size = np.maximum(np.linalg.norm(chord, axis=1) * np.linalg.norm(before, axis=1), 1e-12)
     return float(np.arccos(np.clip(np.einsum("nd,nd->n", chord, before) / size, -1.0, 1.0)).max())
-
-
-def _rise(flank: Flank, starts_mm: Floats, low_mm: float) -> Floats:
-    """Return points (levels, n, 3) up the flank from its rim, each the nearest one on the next contour line."""
-    high_mm = min(BAND * low_mm, low_mm + BAND_OF_HEIGHT * (float(flank.height_mm.max()) - low_mm))
-    points = [starts_mm]
-    for height_mm in np.linspace(low_mm, high_mm, N_LEVELS)[1:]:
-        line_mm = flank.isoline(float(height_mm))
-        points.append(line_mm[cKDTree(line_mm).query(points[-1])[1]])
-    return np.stack(points)
-
-
-def _parabolas(points_mm: Floats) -> Floats:
-    """Return least-squares coefficients (n, 3, 3) of 1, t, t^2 of lines (levels, n, 3), with t the arc length."""
-    steps = np.linalg.norm(np.diff(points_mm, axis=0), axis=2)
-    length = np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)]).T
-    return np.asarray(np.linalg.pinv(length[..., None] ** np.arange(3)) @ points_mm.transpose(1, 0, 2))
-
-
-def _convex(bend: Floats) -> Floats:
-    """Return parabolas (n, 3, 3) around a ring with concave ones straightened."""
-    # A sac is convex. A concave flank is the flare of its mouth, and would lead the extrapolation astray.
-    along = np.roll(bend[:, 0], -1, axis=0) - np.roll(bend[:, 0], 1, axis=0)
-    outward = np.cross(along, bend[:, 1])
-    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-12)
-    hollow = np.maximum(np.einsum("nd,nd->n", bend[:, 2], outward), 0.0)
-    straight = bend.copy()
-    straight[:, 2] -= hollow[:, None] * outward
-    return straight
 
 
 def _length_to_neck(bend: Floats, reach_mm: float, artery: Artery, lumen: Surface) -> Floats:

@@ -29,13 +29,7 @@ PASSING: Final = 2.0
 
 
 def parent_path(vessel: Vessel, bulges: list[Bulge], outlet_mm: Floats | None) -> int:
-    """Return the index of the centerline that the parent artery follows.
-
-    It passes the sac and ends at an outlet, taking the wider branch at every fork. It ends at another inlet only if
-    `outlet_mm` is nearest to that.
-
-    Shapes: `outlet_mm` (3,).
-    """
+    """Return the index of the centerline that the parent artery follows; it ends nearest to `outlet_mm` (3,)."""
     lines = vessel.centerlines
     if outlet_mm is not None:
         ends = np.array([opening.center_mm for opening in vessel.far_ends])
@@ -45,7 +39,12 @@ def parent_path(vessel: Vessel, bulges: list[Bulge], outlet_mm: Floats | None) -
     reach = np.where(leads_out, reach, np.inf)
     passing = np.flatnonzero(reach <= max(PASSING, 1.25 * reach.min()))
     off = [is_off_sacs(line, bulges[:1]) for line in lines]
-    return int(reduce(lambda i, k: i if _is_wider(lines[i], lines[k], off[i], off[k]) else k, passing))
+
+    def wider(i: int, k: int) -> int:
+        widths = _width_beyond_fork(lines[i], lines[k], off[i]), _width_beyond_fork(lines[k], lines[i], off[k])
+        return i if widths[0] >= widths[1] else k
+
+    return reduce(wider, passing.tolist())
 
 
 def is_off_sacs(line: Centerline, bulges: list[Bulge]) -> Bools:
@@ -62,11 +61,6 @@ def reach_of(line: Centerline, bulge: Bulge) -> float:
     return float((cKDTree(bulge.foot_mm).query(line.points_mm)[0] / radius).min())
 
 
-def _is_wider(one: Centerline, other: Centerline, one_is_off: Bools, other_is_off: Bools) -> bool:
-    """Return whether the first of two centerlines is wider over `REACH_MM` beyond their fork."""
-    return _width_beyond_fork(one, other, one_is_off) >= _width_beyond_fork(other, one, other_is_off)
-
-
 def _width_beyond_fork(line: Centerline, other: Centerline, is_off: Bools) -> float:
     """Return the median radius of a centerline over `REACH_MM` beyond its fork; 0 where it parts in the sac only."""
     distance = curves.project(other.points_mm, line.points_mm)[1]
@@ -77,14 +71,9 @@ def _width_beyond_fork(line: Centerline, other: Centerline, is_off: Bools) -> fl
     beyond = (line.abscissa_mm >= fork_mm) & (line.abscissa_mm <= fork_mm + REACH_MM)
     # A path that is mostly in the sac leads to a branch of the sac. The width of the sac is not that of the branch.
     own = beyond & is_off if (beyond & is_off).sum() < 0.5 * beyond.sum() else beyond
-    share = BACK if _turns_back(line, float(fork_mm)) else 1.0
-    return share * float(np.median(line.inscribed_radius_mm[own]))
-
-
-def _turns_back(line: Centerline, fork_mm: float) -> bool:
-    """Return whether a centerline turns back, over `REACH_MM` on both sides of where it parts from another."""
     # Centerlines part where one leaves the inscribed sphere of the other, some distance beyond the fork.
-    shared_mm = fork_mm - SHARED * float(np.interp(fork_mm, line.abscissa_mm, line.inscribed_radius_mm))
+    shared_mm = float(fork_mm) - SHARED * float(np.interp(fork_mm, line.abscissa_mm, line.inscribed_radius_mm))
     places_mm = np.array([shared_mm - REACH_MM, shared_mm, fork_mm, fork_mm + REACH_MM])
-    before, _, beyond = np.diff(line.at(np.clip(places_mm, 0.0, line.length_mm)), axis=0)
-    return bool(before @ beyond < np.cos(BACK_RAD) * np.linalg.norm(before) * np.linalg.norm(beyond))
+    before, _, after = np.diff(line.at(np.clip(places_mm, 0.0, line.length_mm)), axis=0)
+    turns_back = before @ after < np.cos(BACK_RAD) * np.linalg.norm(before) * np.linalg.norm(after)
+    return (BACK if turns_back else 1.0) * float(np.median(line.inscribed_radius_mm[own]))

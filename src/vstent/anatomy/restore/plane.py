@@ -20,7 +20,7 @@ from vstent.anatomy.restore.tubes import Tubes
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Aneurysm, NeckPlane
 from vstent.kernels import curves, sections, triangles
-from vstent.kernels.arrays import Bools, Floats, Ints
+from vstent.kernels.arrays import Floats, Ints
 
 REACH: Final = 2.0
 """Wall farther from the bulge than this many radii of the artery there is beyond the neck; arteries are open there."""
@@ -46,8 +46,6 @@ NEAR_OFFSETS: Final = np.linspace(-0.6, 0.6, 13)
 """Offsets of the planes that are compared with the best one, in radii of its section."""
 NEAR_TILTS: Final = np.tan(np.radians([10.0, 20.0]))
 """Tangents of their angles with it."""
-
-
 ARTERY, BULGE, BRANCH = 2, 3, 4
 """Columns of the measures of a sac: artery wall, wall of the bulge, and cut branches in it; areas in mm2."""
 
@@ -61,10 +59,7 @@ class Wall(NamedTuple):
     """Face in the dome."""
 
     def ratios(self, points_mm: Floats, normals: Floats) -> tuple[Floats, Floats]:
-        """Return the ratio (k,) of surface to volume for planes (k, 3), in 1/mm, and their section (k,) in mm2.
-
-        The ratio is infinite for a plane that separates no sac.
-        """
+        """Return surface over volume (k,) for planes (k, 3), infinite without a sac, and the areas of sections (k,)."""
         measures, is_closed = sections.beyond(self.sheet, self.seed, points_mm, normals)
         volume, section = measures.T[:2]
         is_sac = is_closed & (volume > 0) & (section > 0)
@@ -86,12 +81,12 @@ def plane_sac(lumen: Surface, tubes: Tubes, bulge: Bulge) -> Aneurysm | None:
         best = _best(wall, bulge)
         if best is None:
             continue
-        area_mm2 = best.areas_mm2
-        if best.measures[BRANCH] > 0:
+        point, normal, measures, area_mm2 = best
+        if measures[BRANCH] > 0:
             without = _best(_wall(fields, faces, 0.0, bulge), bulge)
-            area_mm2 = area_mm2 if without is None else np.append(area_mm2, without.measures[1])
-        sac, neck = cut_at(wall, best.point, best.normal)
-        plane = NeckPlane(best.normal, neck.vertices_mm[:-1], (float(area_mm2.min()), float(area_mm2.max())))
+            area_mm2 = area_mm2 if without is None else np.append(area_mm2, without[2][1])
+        sac, neck = cut_at(wall, point, normal)
+        plane = NeckPlane(normal, neck.vertices_mm[:-1], (float(area_mm2.min()), float(area_mm2.max())))
         return Aneurysm(sac, neck, plane.rim_mm, plane)
     return None
 
@@ -112,21 +107,11 @@ def _wall(fields: Floats, faces: Ints, thin_mm: float, bulge: Bulge) -> Wall:
     return Wall(sections.sheet(points, faces, weights[faces].mean(axis=1)), seed)
 
 
-class _Best(NamedTuple):
-    """The best of all planes."""
+def _best(wall: Wall, bulge: Bulge) -> tuple[Floats, Floats, Floats, Floats] | None:
+    """Return point (3,), normal (3,) and measures (5,) of the best plane, and sections (k,) of nearly as good ones.
 
-    point: Floats
-    """(3,) point of the plane."""
-    normal: Floats
-    """(3,) unit normal, toward the dome."""
-    measures: Floats
-    """(5,) measures of the part beyond."""
-    areas_mm2: Floats
-    """(k,) areas of the sections by planes that separate nearly as well."""
-
-
-def _best(wall: Wall, bulge: Bulge) -> _Best | None:
-    """Return the best plane; None where no plane separates the sac from the arteries that are open."""
+    None where no plane separates the sac from the arteries that are open.
+    """
     from scipy.optimize import minimize
 
     points, normals = _first_planes(bulge)
@@ -136,32 +121,34 @@ def _best(wall: Wall, bulge: Bulge) -> _Best | None:
         is_apart = all(normals[k] @ normals[other] < np.cos(APART_RAD) for other in starts)
         if np.isfinite(ratio[k]) and is_apart and len(starts) < N_STARTS:
             starts.append(int(k))
-    found = []
-    for k in starts:
-        frame = _Frame(points[k], normals[k])
+    if not starts:
+        return None
 
-        def cost(x: Floats, frame: _Frame = frame) -> float:
-            return float(np.log(wall.ratios(*frame.planes(x[None]))[0][0]))
+    def cost(x: Floats, k: int) -> float:
+        return float(np.log(wall.ratios(*_planes(points[k], normals[k], x[None]))[0][0]))
 
-        result = minimize(
+    simplex = np.concatenate([np.zeros((1, 3)), STEP * np.eye(3)])
+    results = [
+        minimize(
             cost,
             np.zeros(3),
+            (k,),
             method="Nelder-Mead",
-            options={
-                "initial_simplex": np.concatenate([np.zeros((1, 3)), STEP * np.eye(3)]),
-                "xatol": 2e-3,
-                "fatol": 1e-4,
-                "maxfev": 300,
-            },
+            options={"initial_simplex": simplex, "xatol": 2e-3, "fatol": 1e-4, "maxfev": 300},
         )
-        found.append((float(result.fun), *(row[0] for row in frame.planes(result.x[None]))))
-    if not found:
-        return None
-    _, point, normal = min(found, key=lambda one: one[0])
+        for k in starts
+    ]
+    k, result = min(zip(starts, results, strict=True), key=lambda pair: float(pair[1].fun))
+    point, normal = (row[0] for row in _planes(points[k], normals[k], result.x[None]))
     measures = sections.beyond(wall.sheet, wall.seed, point[None], normal[None])[0][0]
-    near, near_mm2 = wall.ratios(*_planes_near(point, normal, float(np.sqrt(measures[1] / np.pi))))
-    ratio, area_mm2 = np.concatenate([ratio, near]), np.concatenate([area_mm2, near_mm2])
-    return _Best(point, normal, measures, area_mm2[ratio < (1 + NEARLY) * near.min()])
+    turn = np.pi / 4 * np.arange(8)
+    ring = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    tilts = np.concatenate([np.zeros((1, 2)), *(tangent * ring for tangent in NEAR_TILTS)])
+    offsets_mm = np.repeat(float(np.sqrt(measures[1] / np.pi)) * NEAR_OFFSETS, len(tilts))
+    near = np.column_stack([offsets_mm, np.tile(tilts, (len(NEAR_OFFSETS), 1))])
+    near_ratio, near_mm2 = wall.ratios(*_planes(point, normal, near))
+    is_good = np.concatenate([ratio, near_ratio]) < (1 + NEARLY) * near_ratio.min()
+    return point, normal, measures, np.concatenate([area_mm2, near_mm2])[is_good]
 
 
 def _first_planes(bulge: Bulge) -> tuple[Floats, Floats]:
@@ -176,39 +163,24 @@ def _first_planes(bulge: Bulge) -> tuple[Floats, Floats]:
     return points.reshape(-1, 3), np.broadcast_to(every, points.shape).reshape(-1, 3)
 
 
-def _planes_near(point: Floats, normal: Floats, radius_mm: float) -> tuple[Floats, Floats]:
-    """Return points (k, 3) and unit normals (k, 3) of planes near the one whose section has a given radius."""
-    turn = np.pi / 4 * np.arange(8)
-    ring = np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    tilts = np.concatenate([np.zeros((1, 2)), *(tangent * ring for tangent in NEAR_TILTS)])
-    offsets_mm = np.repeat(radius_mm * NEAR_OFFSETS, len(tilts))
-    return _Frame(point, normal).planes(np.column_stack([offsets_mm, np.tile(tilts, (len(NEAR_OFFSETS), 1))]))
-
-
-class _Frame(NamedTuple):
-    """Coordinates of the planes near a plane: offset in mm along its normal, and two tangents of angles."""
-
-    point: Floats
-    """(3,) point of the plane."""
-    normal: Floats
-    """(3,) unit normal."""
-
-    def planes(self, x: Floats) -> tuple[Floats, Floats]:
-        """Return points (k, 3) and unit normals (k, 3) of planes with coordinates (k, 3)."""
-        first = curves.any_perpendicular(self.normal)
-        normals = self.normal + x[:, 1:2] * first + x[:, 2:] * np.cross(self.normal, first)
-        return self.point + x[:, :1] * self.normal, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+def _planes(point: Floats, normal: Floats, x: Floats) -> tuple[Floats, Floats]:
+    """Return points and normals (k, 3) of planes near one: offset in mm and tangents of two angles, the rows of `x`."""
+    first = curves.any_perpendicular(normal)
+    normals = normal + x[:, 1:2] * first + x[:, 2:] * np.cross(normal, first)
+    return point + x[:, :1] * normal, normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
 def cut_at(wall: Wall, point: Floats, normal: Floats) -> tuple[Surface, Surface]:
-    """Cut a sac off its wall by a plane.
-
-    Shapes: `point` (3,), `normal` (3,).
-    """
+    """Cut a sac off its wall by a plane through a point (3,) with a normal (3,); return sac and neck."""
     vertices, faces = wall.sheet.vertices, wall.sheet.faces
     height_mm = (vertices - point) @ normal
-    is_sac = _is_sac(wall, height_mm > 0)
-    # A pouch is not cut: its vertices are on the sac's side of the level, whatever their height.
+    is_up, edges = height_mm > 0, triangles.directed_edges(faces)
+    label = triangles.joined(edges[is_up[edges].all(axis=1)], len(is_up))
+    corner = faces[wall.seed][is_up[faces[wall.seed]]][0]
+    is_beyond = is_up & (label == label[corner])
+    # A pouch has no way to the open ends of the wall. It is not cut: its vertices are on the sac's side of the level.
+    label = triangles.joined(edges[~is_beyond[edges].any(axis=1)], len(is_up))
+    is_sac = is_beyond | ~np.isin(label, label[np.unique(triangles.open_edges(faces))])
     level = np.where(is_sac, -1.0, 1.0) * np.maximum(np.abs(height_mm), 1e-9)
     vertices, faces, _ = triangles.clip(vertices, faces, level)
     vertices, faces = triangles.compact(vertices, faces)
@@ -220,15 +192,3 @@ def cut_at(wall: Wall, point: Floats, normal: Floats) -> tuple[Surface, Surface]
     k, rim = len(loops[0]), np.append(vertices[loops[0]], points[len(vertices)][None], axis=0)
     here, there = np.arange(k), (np.arange(k) + 1) % k
     return Surface(points, closed), Surface(rim, np.stack([here, there, np.full(k, k)], axis=1))
-
-
-def _is_sac(wall: Wall, is_up: Bools) -> Bools:
-    """Return whether each vertex (n,) is beyond the plane and connected to the dome, or in a pouch."""
-    faces = wall.sheet.faces
-    edges = triangles.directed_edges(faces)
-    label = triangles.joined(edges[is_up[edges].all(axis=1)], len(is_up))
-    corner = faces[wall.seed][is_up[faces[wall.seed]]][0]
-    is_beyond = is_up & (label == label[corner])
-    label = triangles.joined(edges[~is_beyond[edges].any(axis=1)], len(is_up))
-    at_ends = np.unique(triangles.open_edges(faces))
-    return is_beyond | ~np.isin(label, label[at_ends])

@@ -18,7 +18,7 @@ from vstent.anatomy.restore.bulges import Bulge, find_bulges, flat_bulges
 from vstent.anatomy.restore.candidates import classified
 from vstent.anatomy.restore.drawn import Drawn, cut_along
 from vstent.anatomy.restore.landing import Landing, close_landing
-from vstent.anatomy.restore.notes import candidates_told, flat_told, necks_told, told
+from vstent.anatomy.restore.notes import told
 from vstent.anatomy.restore.path import PASSING, parent_path, reach_of
 from vstent.anatomy.restore.plane import plane_sac
 from vstent.anatomy.restore.sac import cut_sac, drawn_sac, is_beside_branch, is_in_one, is_sac
@@ -82,7 +82,8 @@ def restore(
         others: list[Candidate] = []
         while bulges and not any(one.is_aneurysm for one in candidates):
             others += candidates
-            bulges = _but(bulges, sacs)
+            left = [bulge for bulge in bulges if not is_in_one(bulge.points_mm, sacs)]
+            bulges = left if len(left) < len(bulges) else bulges[1:]
             path, landing, sacs = _closed(vessel, bulges, outlet_mm)
             candidates = [_classified(vessel, landing, sac) for sac in sacs]
         sacs = [sac for sac, one in zip(sacs, candidates, strict=True) if one.is_aneurysm]
@@ -90,12 +91,7 @@ def restore(
     aneurysms = tuple(sorted(sacs, key=lambda sac: -sac.sac.volume_mm3))
     flat = None if aneurysms or at_mm is not None else _flat_sac(vessel, outlet_mm, path, landing)
     parent = Path(PARENT, landing.axis, landing.section_radius_mm, landing.surface, landing.is_restored.ravel())
-    notes = (
-        *told(vessel, path, bulges or found, aneurysms),
-        *(necks_told(aneurysms) if drawn is None else ()),
-        *candidates_told(aneurysms, candidates),
-        *flat_told(flat),
-    )
+    notes = told(vessel, path, bulges or found, aneurysms, candidates, flat, is_drawn=drawn is not None)
     return continued(Anatomy(vessel, (parent,), aneurysms, notes, tuple(candidates)))
 
 
@@ -107,7 +103,12 @@ def _closed(
     landing = _landing(vessel, path, bulges, drawn.artery if drawn else None)
     if drawn:
         return path, landing, [drawn_sac(vessel, landing, _all_but(path, vessel.centerlines), drawn)]
-    return path, landing, _sacs(vessel, path, landing, list(bulges))
+    tubes, sacs = tubes_of(vessel.centerlines), list[Aneurysm]()
+    for bulge in bulges:
+        sac = _sac(vessel, path, landing, tubes, bulge)
+        # Bulges that are separate above the tubes may be one sac above the landing surface, which is lower.
+        sacs += [] if sac is None or is_in_one(sac.sac.vertices_mm, sacs) else [sac]
+    return path, landing, sacs
 
 
 def _classified(vessel: Vessel, landing: Landing, sac: Aneurysm) -> Candidate:
@@ -117,16 +118,15 @@ def _classified(vessel: Vessel, landing: Landing, sac: Aneurysm) -> Candidate:
     return classified(vessel, sac, 2 * float(np.interp(middle_mm, landing.axis.abscissa_mm, landing.section_radius_mm)))
 
 
-def _but(bulges: Sequence[Bulge], sacs: Sequence[Aneurysm]) -> list[Bulge]:
-    """Return the bulges that are in none of the sacs; all but the first where no bulge is in a sac."""
-    left = [bulge for bulge in bulges if not is_in_one(bulge.points_mm, sacs)]
-    return left if len(left) < len(bulges) else list(bulges[1:])
-
-
 def _landing(vessel: Vessel, path: int, bulges: Sequence[Bulge], own: Surface | None = None) -> Landing:
     """Return the landing surface along a centerline, with the necks of bulges closed; `own`: see `close_landing`."""
-    line = vessel.centerlines[path]
-    mouths = [Mouth(_foot_on(line, bulge), bulge.inward) for bulge in bulges]
+    line, mouths = vessel.centerlines[path], []
+    for bulge in bulges:
+        # Where a branch arises from the sac beside its neck, the foot runs around the mouth of the branch too.
+        tubes = tubes_of([line])
+        height, sphere = tubes.height_mm(bulge.foot_mm)
+        on_artery = bulge.foot_mm[height < ON_FOOT * tubes.radius_mm[sphere]]
+        mouths.append(Mouth(on_artery if len(on_artery) else bulge.foot_mm, bulge.inward))
     return close_landing(vessel.lumen, fit_axis(vessel.lumen, line, mouths), own)
 
 
@@ -150,16 +150,6 @@ def _all_but(path: int, lines: Sequence[Centerline]) -> list[Centerline]:
     return [line for k, line in enumerate(lines) if k != path]
 
 
-def _sacs(vessel: Vessel, path: int, landing: Landing, bulges: list[Bulge]) -> list[Aneurysm]:
-    """Return the sacs of those bulges that are on the parent artery and not flat."""
-    tubes, found = tubes_of(vessel.centerlines), list[Aneurysm]()
-    for bulge in bulges:
-        sac = _sac(vessel, path, landing, tubes, bulge)
-        # Bulges that are separate above the tubes may be one sac above the landing surface, which is lower.
-        found += [] if sac is None or is_in_one(sac.sac.vertices_mm, found) else [sac]
-    return found
-
-
 def _sac(vessel: Vessel, path: int, landing: Landing, tubes: Tubes, bulge: Bulge) -> Aneurysm | None:
     """Return the sac of a bulge, closed by the wall of its arteries or by its neck plane; None where it is no sac."""
     side_lines = _all_but(path, vessel.centerlines)
@@ -170,24 +160,11 @@ def _sac(vessel: Vessel, path: int, landing: Landing, tubes: Tubes, bulge: Bulge
         is_on_artery = reach_of(vessel.centerlines[path], bulge) <= PASSING
         return flat if is_on_artery and is_sac(flat) else None
     # Where branches leave under a sac, no single wall passes below it, and the curve may follow one of them.
-    if is_beside_branch(landing, side_lines, bulge) and not _agree(curved, flat):
-        return flat
-    return replace(curved, plane=flat.plane)
-
-
-def _agree(curved: Aneurysm, flat: Aneurysm) -> bool:
-    """Return whether the curved neck of a sac is near its plane and as wide as the section there."""
-    assert flat.plane is not None
-    off_mm = np.abs((curved.neck_mm - flat.plane.center_mm) @ flat.plane.normal).max()
-    seen_mm2 = abs(triangles.polygon_area_vector(curved.neck_mm) @ flat.plane.normal)
-    area_mm2 = flat.plane.area_mm2
-    return bool(off_mm < OFF_PLANE * np.sqrt(4 * area_mm2 / np.pi) and seen_mm2 > NECK_SEEN * area_mm2)
-
-
-def _foot_on(line: Centerline, bulge: Bulge) -> Floats:
-    """Return the points (k, 3) of a bulge's foot that are on the artery along a centerline; all where none is."""
-    # Where a branch arises from the sac beside its neck, the foot runs around the mouth of the branch too.
-    tubes = tubes_of([line])
-    height, sphere = tubes.height_mm(bulge.foot_mm)
-    on_artery = bulge.foot_mm[height < ON_FOOT * tubes.radius_mm[sphere]]
-    return on_artery if len(on_artery) else bulge.foot_mm
+    plane = flat.plane
+    assert plane is not None
+    if is_beside_branch(landing, side_lines, bulge):
+        off_mm = np.abs((curved.neck_mm - plane.center_mm) @ plane.normal).max()
+        seen_mm2 = abs(triangles.polygon_area_vector(curved.neck_mm) @ plane.normal)
+        if off_mm >= OFF_PLANE * np.sqrt(4 * plane.area_mm2 / np.pi) or seen_mm2 <= NECK_SEEN * plane.area_mm2:
+            return flat
+    return replace(curved, plane=plane)

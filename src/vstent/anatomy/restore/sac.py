@@ -24,7 +24,7 @@ FLAT: Final = 0.2
 """A sac is rejected as uneven wall if its volume is below this fraction of (neck area)^(3/2); a half sphere has
 0.38."""
 ROUND: Final = 0.6
-"""A shape is rejected as debris of the scan if its `_roundness` is below this. Sacs, including lobed ones, have 0.7 to
+"""A shape is rejected as debris of the scan if its sphericity is below this. Sacs, including lobed ones, have 0.7 to
 0.85."""
 PASSING: Final = 2.5
 """A branch passes under a sac that begins within this many of the branch's radii."""
@@ -53,10 +53,7 @@ ON_SAC_MM: Final = 0.05
 
 
 def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], bulge: Bulge) -> Aneurysm | None:
-    """Cut the sac of a bulge off the lumen.
-
-    Side branches that arise from the sac or beside it are cut off along their own tubes.
-    """
+    """Cut the sac of a bulge off the lumen, and branches that arise from it or beside it off along their own tubes."""
     lumen = vessel.lumen
     artery = _artery(vessel, landing, side_lines, bulge)
     height_mm = artery.height_mm(lumen.vertices_mm, lumen.vertex_normals)
@@ -79,14 +76,11 @@ def cut_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline], 
 
 
 def is_sac(aneurysm: Aneurysm) -> bool:
-    """Return whether a shape that was cut off is neither flat nor debris of the scan.
-
-    Parameters
-    ----------
-    aneurysm : shape and neck.
-    """
-    is_flat = aneurysm.sac.volume_mm3 < FLAT * aneurysm.neck.area_mm2**1.5
-    return not is_flat and _roundness(aneurysm.sac) >= ROUND
+    """Return whether a shape that was cut off is neither flat nor debris of the scan."""
+    volume_mm3, area_mm2 = aneurysm.sac.volume_mm3, aneurysm.sac.area_mm2
+    # Sphericity: area of the sphere of equal volume over the sac's (Wadell 1935, J. Geol. 43:250).
+    roundness = float(np.cbrt(36 * np.pi * max(volume_mm3, 0.0) ** 2)) / area_mm2
+    return volume_mm3 >= FLAT * aneurysm.neck.area_mm2**1.5 and roundness >= ROUND
 
 
 def is_beside_branch(landing: Landing, side_lines: Sequence[Centerline], bulge: Bulge) -> bool:
@@ -113,10 +107,7 @@ def _low_mm(vessel: Vessel, landing: Landing, bulge: Bulge) -> float:
 
 
 def is_in_one(points_mm: Floats, aneurysms: Sequence[Aneurysm]) -> bool:
-    """Return whether most points of a sac or bulge lie in or on one of the aneurysms.
-
-    Shapes: `points_mm` (n, 3).
-    """
+    """Return whether most points (n, 3) of a sac or bulge lie in or on one of the aneurysms."""
     return any(np.median(one.sac.signed_distance(points_mm)) < ON_SAC_MM for one in aneurysms)
 
 
@@ -134,16 +125,8 @@ def drawn_sac(vessel: Vessel, landing: Landing, side_lines: Sequence[Centerline]
     return _aneurysm(artery, Flank(vertices, faces, np.zeros(len(vertices)), rim), loops, rings)
 
 
-def _aneurysm(artery: Artery, flank: Flank, other_loops: list[Ints], rings: Floats) -> Aneurysm:
-    """Return the aneurysm of a flank, its branch mouths, and its continuation, rings (n, k, 3), down to the neck."""
-    neck = _neck(artery, rings[-1])
-    sac = _closed_sac(flank, other_loops, rings, neck)
-    return Aneurysm(sac, neck, rings[-1])
-
-
-def _is_island(lumen: Surface, is_low: Bools) -> Bools:
+def is_island(lumen: Surface, is_low: Bools) -> Bools:
     """Return whether each vertex (n,) is low wall without a connection to an opening over low wall."""
-    # There the sac touches an artery from which it does not arise.
     edges = triangles.directed_edges(lumen.faces)
     edges = edges[is_low[edges].all(axis=1)]
     label = triangles.joined(edges, len(is_low))
@@ -151,16 +134,12 @@ def _is_island(lumen: Surface, is_low: Bools) -> Bools:
     return is_low & ~np.isin(label, label[ends[is_low[ends]]])
 
 
-def _roundness(sac: Surface) -> float:
-    """Return the sphericity: area of the sphere of equal volume over the sac's (Wadell 1935, J. Geol. 43:250)."""
-    return float(np.cbrt(36 * np.pi * max(sac.volume_mm3, 0.0) ** 2)) / sac.area_mm2
-
-
 def _flank(
     lumen: Surface, height_mm: Floats, low_mm: float, dome_mm: Floats, landing: Landing
 ) -> tuple[Flank | None, list[Ints]]:
     """Return the sac's wall above a height and its edges other than the rim; None where it is not on the artery."""
-    is_touching = _is_island(lumen, height_mm < low_mm)
+    # There the sac touches an artery from which it does not arise.
+    is_touching = is_island(lumen, height_mm < low_mm)
     height_mm = np.where(is_touching, 2.0 * low_mm, height_mm)
     level = _level(lumen, height_mm, low_mm)
     placed, faces, _ = triangles.clip(np.column_stack([lumen.vertices_mm, height_mm]), lumen.faces, level)
@@ -180,10 +159,14 @@ def _level(lumen: Surface, height_mm: Floats, low_mm: float) -> Floats:
     # The border moves by at most low_mm squared times its curvature. Spikes narrower than low_mm vanish where the
     # height hardly exceeds it.
     excess = height_mm - low_mm
-    member = np.flatnonzero(_near_border(lumen, excess, SETTLING * low_mm))
+    is_above = excess[lumen.faces] > 0
+    border = lumen.vertices_mm[np.unique(lumen.faces[is_above.any(axis=1) & ~is_above.all(axis=1)])]
     level = -excess
-    if not len(member):
+    if not len(border):
         return level
+    reach_mm = SETTLING * low_mm
+    is_near = np.asarray(cKDTree(border).query(lumen.vertices_mm, distance_upper_bound=reach_mm)[0]) < reach_mm
+    member = np.flatnonzero(is_near)
     number = np.full(len(height_mm), -1)
     number[member] = np.arange(len(member))
     faces = number[lumen.faces[(number[lumen.faces] >= 0).all(axis=1)]]
@@ -192,16 +175,6 @@ def _level(lumen: Surface, height_mm: Floats, low_mm: float) -> Floats:
     gain = np.clip(excess[member], -low_mm, low_mm) / low_mm**2
     level[member] = low_mm * region(lumen.vertices_mm[member], faces, gain, edge, low_mm)
     return level
-
-
-def _near_border(lumen: Surface, excess: Floats, reach_mm: float) -> Bools:
-    """Return whether each vertex (n,) is within `reach_mm` of where the excess (n,) changes sign."""
-    is_above = excess[lumen.faces] > 0
-    crossed = is_above.any(axis=1) & ~is_above.all(axis=1)
-    border = lumen.vertices_mm[np.unique(lumen.faces[crossed])]
-    if not len(border):
-        return np.zeros(len(excess), dtype=bool)
-    return np.asarray(cKDTree(border).query(lumen.vertices_mm, distance_upper_bound=reach_mm)[0]) < reach_mm
 
 
 def _artery(vessel: Vessel, landing: Landing, lines: Sequence[Centerline], bulge: Bulge) -> Artery:
@@ -221,16 +194,12 @@ def _artery(vessel: Vessel, landing: Landing, lines: Sequence[Centerline], bulge
             landings.append(side)
             place, _ = curves.project(side.points_mm, line.points_mm)
             is_branch &= (place <= 0) | (place >= curves.arc_length(side.points_mm)[-1])
-        proper += [Centerline(line.points_mm[run], line.inscribed_radius_mm[run]) for run in _runs(is_branch)]
+        runs = np.flatnonzero(np.diff(np.concatenate([[False], is_branch, [False]]).astype(int))).reshape(-1, 2)
+        slices = [slice(first, last) for first, last in runs if last - first > 1]
+        proper += [Centerline(line.points_mm[run], line.inscribed_radius_mm[run]) for run in slices]
     branches = tubes_of(proper)
     along_mm = np.concatenate([np.zeros(0), *(line.abscissa_mm for line in proper)])
     return Artery(tuple(landings), branches, apart_mm(landings, branches, along_mm, _low_mm(vessel, landing, bulge)))
-
-
-def _runs(member: Bools) -> list[slice]:
-    """Return the slices of consecutive members (n,), each with at least two."""
-    change = np.flatnonzero(np.diff(np.concatenate([[False], member, [False]]).astype(int)))
-    return [slice(first, last) for first, last in change.reshape(-1, 2) if last - first > 1]
 
 
 def _beside(lumen: Surface, landing: Landing, line: Centerline, bulge: Bulge) -> Landing | None:
@@ -271,16 +240,11 @@ def _into_parent(landing: Landing, line: Centerline, bulge: Bulge) -> Centerline
         one, other = line.points_mm[away], landing.points_mm[parent]
         chords = one[-1] - one[0], other[-1] - other[0]
         if chords[0] @ chords[1] > TURNED_BACK * float(np.linalg.norm(chords[0]) * np.linalg.norm(chords[1])):
+            points = np.concatenate([one, other])
             widths = np.concatenate([line.inscribed_radius_mm[away], landing.section_radius_mm[parent]])
-            return _evenly(np.concatenate([one, other]), widths)
+            even, along = curves.resample(points, COURSE_STEP_MM), curves.arc_length(points)
+            return Centerline(even, np.interp(np.linspace(0.0, along[-1], len(even)), along, widths))
     return None
-
-
-def _evenly(points_mm: Floats, radius_mm: Floats) -> Centerline:
-    """Return a centerline with evenly spaced points through points (n, 3) with radii (n,)."""
-    even = curves.resample(points_mm, COURSE_STEP_MM)
-    share = np.linspace(0.0, curves.arc_length(points_mm)[-1], len(even))
-    return Centerline(even, np.interp(share, curves.arc_length(points_mm), radius_mm))
 
 
 def _neck(artery: Artery, rim_mm: Floats) -> Surface:
@@ -312,21 +276,19 @@ def _neck(artery: Artery, rim_mm: Floats) -> Surface:
     return Surface(vertices, np.concatenate(faces))
 
 
-def _closed_sac(flank: Flank, other_loops: list[Ints], rings: Floats, neck: Surface) -> Surface:
-    """Return the closed surface of a sac: its wall, the caps of its branches, its continuation and its neck."""
+def _aneurysm(artery: Artery, flank: Flank, other_loops: list[Ints], rings: Floats) -> Aneurysm:
+    """Return the aneurysm of a flank, its branch mouths, and its continuation, rings (n, k, 3), down to the neck."""
+    neck = _neck(artery, rings[-1])
     points, wall = triangles.cap(flank.vertices_mm, flank.faces, other_loops)
     n_below, k = len(rings) - 1, len(flank.rim)
     # The first ring of the skirt is the rim, and its last ring is the first ring of the neck: these vertices are
     # shared.
     number = np.concatenate([flank.rim, len(points) + np.arange(n_below * k)]).reshape(-1, k)
-    strips = [_strip(number[i], number[i + 1]) for i in range(n_below)]
+    upper, lower = number[:-1], number[1:]
+    ahead_up, ahead_low = np.roll(upper, -1, axis=1), np.roll(lower, -1, axis=1)
+    strips = np.stack([ahead_up, upper, lower, ahead_up, lower, ahead_low], axis=-1)
+    strips = strips.reshape(n_below, k, 2, 3).transpose(0, 2, 1, 3).reshape(-1, 3)
     first = len(points) + n_below * k
     on_neck = np.concatenate([number[-1], first + np.arange(len(neck.vertices_mm) - k)])
     vertices = np.concatenate([points, rings[1:].reshape(-1, 3), neck.vertices_mm[k:]])
-    return Surface(vertices, np.concatenate([wall, *strips, on_neck[neck.faces[:, ::-1]]]))
-
-
-def _strip(upper: Ints, lower: Ints) -> Ints:
-    """Return outward triangles between two rings of vertices (k,) that run in the direction of the wall above them."""
-    ahead_up, ahead_low = np.roll(upper, -1), np.roll(lower, -1)
-    return np.concatenate([np.stack([ahead_up, upper, lower], 1), np.stack([ahead_up, lower, ahead_low], 1)])
+    return Aneurysm(Surface(vertices, np.concatenate([wall, strips, on_neck[neck.faces[:, ::-1]]])), neck, rings[-1])

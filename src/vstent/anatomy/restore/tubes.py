@@ -29,17 +29,7 @@ class Tubes:
         freeze(self, "radius_mm", np.float64, (len(self.centers_mm),))
 
     def height_mm(self, points_mm: Floats) -> tuple[Floats, Ints]:
-        """Return the height of points above the wall of the tubes.
-
-        Parameters
-        ----------
-        points_mm : (n, 3) points in mm.
-
-        Returns
-        -------
-        height : (n,) distance to the wall of the tubes in mm, negative inside; inf without tubes.
-        sphere : (n,) index of the sphere with the nearest wall.
-        """
+        """Return the height (n,) of points (n, 3) above the tubes' wall, inf without any, and the sphere there (n,)."""
         if not len(self.centers_mm):
             return np.full(len(points_mm), np.inf), np.zeros(len(points_mm), dtype=np.int32)
         distance, nearest = cKDTree(self.centers_mm).query(points_mm)
