@@ -171,7 +171,7 @@ def kernel_times(state: State, rounds: int, pairs: Pairs) -> dict[str, tuple[int
         begin, began = clock.now(), time.perf_counter()
         launch(device.stream, *further)
         host_s = time.perf_counter() - began
-        found.setdefault(launch.name, []).append((begin, clock.now(), host_s))
+        found.setdefault(launch.kernel.__name__, []).append((begin, clock.now(), host_s))
     device.stream.synchronize()
     return {
         name: (
