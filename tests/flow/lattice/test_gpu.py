@@ -38,7 +38,7 @@ from vstent.study import repeat
 from vstent.study.provenance import machine, provenance
 from vstent.study.settings import Settings
 
-CELL_MM, RADIUS_MM, LENGTH_MM = 0.4, 0.8, 2.4
+CELL_MM, RADIUS_MM, LENGTH_MM = 0.4, 0.7, 0.8
 SETTLED_PAIRS = 3 * lattice_state.DEFER_PAIRS
 """What is deferred and balanced changes in the first of the pairs compared."""
 ROUNDING = 2e-6
@@ -165,13 +165,14 @@ def simulate(script: str, folder: Path, state: lattice_state.State) -> None:
     """Run a script on numba's simulator, with the path of a state and a path for results as arguments."""
     (folder / "state").write_bytes(pickle.dumps(state))
     simulated = os.environ | {"NUMBA_ENABLE_CUDASIM": "1"}
-    command = [sys.executable, "-W", "error", "-c", script, str(folder / "state"), str(folder / "found.npz")]
+    often = "import sys; sys.setswitchinterval(5e-4)\n"  # the simulator's threads wait for each other
+    command = [sys.executable, "-W", "error", "-c", often + script, str(folder / "state"), str(folder / "found.npz")]
     ran = subprocess.run(command, env=simulated, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr
 
 
 def test_a_gpu_makes_the_steps_that_a_processor_makes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(domain, "MIN_CELLS", 50)
+    monkeypatch.setattr(domain, "MIN_CELLS", 30)
     state = everything()
     stepping.advance(state, 2 * SETTLED_PAIRS)
     simulate(ON_GPU, tmp_path, state)
@@ -188,7 +189,7 @@ def test_a_gpu_makes_the_steps_that_a_processor_makes(tmp_path: Path, monkeypatc
 
 
 def test_a_gpu_goes_on_while_the_host_judges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(domain, "MIN_CELLS", 50)
+    monkeypatch.setattr(domain, "MIN_CELLS", 30)
     simulate(AHEAD, tmp_path, everything())
 
 
