@@ -19,7 +19,7 @@ from vstent.flow.case import FlowField
 from vstent.flow.engines import Outcome
 from vstent.flow.grade import grade
 from vstent.flow.indices import indices
-from vstent.flow.lattice import packing, settling, stepping
+from vstent.flow.lattice import gpu_tables, settling, stepping
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.reading import field_of, read
 from vstent.flow.lattice.state import State
@@ -61,14 +61,14 @@ def table(anatomy: Anatomy, spacing_mm: float) -> None:
     print("| work of the processor | s |\n|---|---|")
     timed("grid and distances from the wall", lambda: engine.prepare(bare))
     before = engine.init(bare, None)
-    timed("tables of the GPU, first flow", lambda: packing.pack(before))
+    timed("tables of the GPU, first flow", lambda: gpu_tables.tables_of(before))
     stepping.advance(before, 2)
     before.snapshots.append(stepping.snapshot(before))
     before.loop_seconds = 1.0
     start = result_of(before)
     case = timed("screen of Silk", lambda: flow_case(anatomy, (stent,), settings))
     state = timed("links, screen on the grid, monitored places, initial flow", lambda: engine.init(case, start))
-    timed("tables of the GPU, later flow", lambda: packing.pack(state))
+    timed("tables of the GPU, later flow", lambda: gpu_tables.tables_of(state))
     state.loop_seconds = 1.0
     for _ in range(2 * settling.CHECKS_APART):
         state.snapshots.append(stepping.snapshot(state))

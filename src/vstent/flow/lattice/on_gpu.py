@@ -11,12 +11,10 @@ import numpy as np
 from numba import cuda
 from numpy.typing import NDArray
 
-from vstent.flow.lattice.gpu_tables import PAIRS, START, Numbers, correction_of, numbers_of, single_of, tables
+from vstent.flow.lattice.gpu_tables import PAIRS, START, correction_of, joined, layout_of, rates_of, tables_of
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.kernels import gpu as kernels
 from vstent.flow.lattice.kernels.gpu import THREADS
-from vstent.flow.lattice.packing import Layout, Packed, pack
-from vstent.flow.lattice.readback import ReadBack
 from vstent.flow.lattice.recording import NotRecordedError, Pairs, plan, recorded
 from vstent.flow.lattice.state import DEFER_PAIRS, DEFER_PART, State
 from vstent.kernels.arrays import Floats, Ints
@@ -39,11 +37,6 @@ class Launch:
     arguments: tuple[Any, ...]
     """Its first arguments."""
 
-    @property
-    def name(self) -> str:
-        """Return the name of the kernel."""
-        return str(self.kernel.__name__)
-
     def __call__(self, stream: Any, *further: Any) -> None:
         """Launch the kernel on a stream, with further arguments."""
         if self.threads:
@@ -51,27 +44,47 @@ class Launch:
 
 
 class Device:
-    """The arrays of a run on the GPU and its kernels."""
+    """The arrays of a run on the GPU and its kernels (see `state.OnDevice`)."""
 
     def __init__(self, state: State) -> None:
         """Copy all arrays that the time steps need to the GPU."""
-        a, links, packed = state.addressing, state.links, pack(state)
-        at = tables(packed, numbers_of(state, packed))
-        self._packed, self._at, self._cells, self.stream = packed, at, len(packed.code), cuda.stream()
+        a, links, at = state.addressing, state.links, tables_of(state)
+        cells, ends = len(a.place), int(links.start[-1])
+        self._at, self._slot, self.stream = at, layout_of(state).slot, cuda.stream()
         self._populations, self._shape = put(state.populations), put(links.shape)
         self._integers, self._singles, self._doubles = put(at.integers), put(at.singles), put(at.doubles)
-        self._common = self._populations, self._integers, self._singles
-        self._layout = a.stride, at.code_at
-        self._through = put(np.zeros(len(links.address), np.float32))
-        self._density, self._velocity = (put(np.zeros((self._cells, *n), np.float32)) for n in ((), (3,)))
-        self._outflow, self._times = (
-            put(np.zeros(len(links.openings))),
-            put(np.zeros(len(state.screen.cell), np.float32)),
+        blocks = len(layout_of(state).tables[kernels.BLOCKS])
+        common, layout = (self._populations, self._integers, self._singles), (a.stride, at.places["code"].start)
+        of_cells, of_links = (a.stride, cells, at.places["code"].start), common[:2]
+        # The kernels of a pair of steps, the last without its last argument: openings, even step, septa, odd step.
+        self._steps = (
+            Launch(kernels.drive, blocks * THREADS, (*common, self._doubles, *layout)),
+            Launch(kernels.even_step, cells, (*common, self._doubles, self._shape, *of_cells)),
+            Launch(kernels.swap, a.septa.shape[1], of_links),
+            Launch(kernels.odd_step, cells, (*common, *of_cells)),
         )
-        self._moments = ReadBack((self._density, self._velocity, self._outflow))
-        self._steps = self._kernels_of_pair(state)
-        self._settle = self._kernels_of_walls()
-        self._read, self._read_times = self._kernels_of_reading(state)
+        # Those of the walls without their last argument: deferred correction and mass balance.
+        self._settle = (
+            Launch(kernels.defer, len(links.address) - ends, common),
+            Launch(kernels.balance, max(1, len(state.refill.groups[0]) - 1), common[1:]),
+        )
+        density, velocity = put(np.zeros(cells, np.float32)), put(np.zeros((cells, 3), np.float32))
+        through_ends = put(np.zeros(ends))
+        self._read = (
+            Launch(kernels.moments, cells, (*common, *layout, density, velocity)),
+            Launch(kernels.sent, ends, (*of_links, through_ends)),
+        )
+        self._moments, self._starts = ReadBack((density, velocity, through_ends)), links.start[:-1]
+        screened = state.screen.cell.astype(np.int32)
+        self._times = put(np.zeros(len(screened), np.float32))
+        self._read_times = Launch(kernels.times, len(screened), (*common, *layout, put(screened), self._times))
+        self._through = put(np.zeros(len(links.address), np.float32))
+        # Those of a longer time step, of which the second and third take their factors.
+        self._lengthen = (
+            Launch(kernels.sent, len(links.address), (*of_links, self._through)),
+            Launch(kernels.rescale, cells, (*of_links, *of_cells)),
+            Launch(kernels.resend, len(links.address), (*of_links, self._through)),
+        )
         self._replay: dict[Pairs, Any] | None = None
         self._why = ""
         self._begun = 0
@@ -84,42 +97,9 @@ class Device:
     @property
     def nbytes(self) -> int:
         """Return the memory of the run on the GPU, in bytes."""
-        known = {
-            id(array): array
-            for launch in (*self._steps, *self._settle, *self._read)
-            for array in _arrays(launch.arguments)
-        }
-        return sum(array.nbytes for array in (*known.values(), self._through))
-
-    def _kernels_of_pair(self, state: State) -> tuple[Launch, Launch, Launch, Launch]:
-        """Return the kernels of a pair of steps: openings, even step, septa, and odd step without its last argument."""
-        septa, (stride, code_at) = state.addressing.septa.shape[1], self._layout
-        cells = stride, self._cells, code_at
-        drive = *self._common, self._doubles, *self._layout
-        return (
-            Launch(kernels.drive, self._at.blocks * THREADS, drive),
-            Launch(kernels.even_step, self._cells, (*self._common, self._doubles, self._shape, *cells)),
-            Launch(kernels.swap, septa, self._common[:2]),
-            Launch(kernels.odd_step, self._cells, (*self._common, *cells)),
-        )
-
-    def _kernels_of_walls(self) -> tuple[Launch, Launch]:
-        """Return the kernels of the deferred wall correction and of the mass balance, without their last argument."""
-        layout = self._packed.layout
-        return (
-            Launch(kernels.defer, len(layout.slot) - len(layout.opening_of_end), self._common),
-            Launch(kernels.balance, max(1, len(layout.groups[0]) - 1), self._common[1:]),
-        )
-
-    def _kernels_of_reading(self, state: State) -> tuple[tuple[Launch, Launch], Launch]:
-        """Return the kernels that write density, velocity and flow rates, and the one that writes relaxation times."""
-        packed, everywhere = self._packed, (*self._common, *self._layout)
-        ends = put(packed.layout.end_cell), put(packed.layout.end_cell_start), self._outflow
-        screened = put(state.screen.cell.astype(np.int32)), self._times
-        return (
-            Launch(kernels.moments, self._cells, (*everywhere, self._density, self._velocity)),
-            Launch(kernels.outflow, len(state.links.openings) * THREADS, (*everywhere, *ends)),
-        ), Launch(kernels.times, len(state.screen.cell), (*everywhere, *screened))
+        launches = *self._steps, *self._settle, *self._read, *self._lengthen
+        arrays = {id(array): array for launch in launches for array in launch.arguments if hasattr(array, "nbytes")}
+        return sum(array.nbytes for array in arrays.values())
 
     def advance(self, wanted: Floats, moments: Floats, first_pair: int) -> None:
         """Make one pair of time steps per row of `wanted` (see `state.OnDevice`)."""
@@ -146,32 +126,29 @@ class Device:
         return self._begun > 0
 
     def _queue(self, rows: Floats, first_pair: int) -> None:
-        """Queue pairs of time steps with these boundary values."""
-        self._impose(rows)
-        for pairs in plan(first_pair, len(rows)):
-            self._make(pairs)
-
-    def _impose(self, rows: Floats) -> None:
-        """Copy the boundary values of the next pairs of steps to the GPU; populations are at home before the first."""
+        """Queue pairs of time steps with these boundary values; populations are at home before the first."""
         whole = np.repeat(rows[-1:], PAIRS, axis=0)
         whole[: len(rows)] = rows
-        self._doubles[self._at.imposed].copy_to_device(whole.ravel())
+        self._doubles[self._at.places[kernels.IMPOSED]].copy_to_device(whole.ravel())
         self._integers[: len(START)].copy_to_device(np.array(START, np.int32))
+        for pairs in plan(first_pair, len(rows)):
+            if self._replay:
+                self._replay[pairs]()
+            else:
+                self.make(pairs)
 
     def _recorded(self) -> dict[Pairs, Any]:
         """Return functions that replay each sequence of pairs; empty where they cannot be recorded."""
         try:
-            return {pairs: recorded(partial(self._make, pairs), self.stream) for pairs in Pairs}
+            return {pairs: recorded(partial(self.make, pairs), self.stream) for pairs in Pairs}
         except NotRecordedError as reason:
             self.stream, self._why = cuda.stream(), f", because {reason}"
             return {}
 
-    def _make(self, pairs: Pairs) -> None:
-        """Make pairs of time steps: by a replay, or by the same launches where there is none."""
-        if self._replay:
-            self._replay[pairs]()
-        else:
-            self._launch_all(self.launches(pairs))
+    def make(self, pairs: Pairs) -> None:
+        """Launch the kernels of pairs of time steps one by one."""
+        for launch, further in self.launches(pairs):
+            launch(self.stream, *further)
 
     def launches(self, pairs: Pairs) -> Iterator[tuple[Launch, tuple[Any, ...]]]:
         """Yield the kernels of pairs of time steps in their order, with their further arguments."""
@@ -182,51 +159,37 @@ class Device:
         drive, even_step, swap, odd_step = self._steps
         last = odd_step, (int(pairs is not Pairs.PLAIN),)
         yield from ((drive, ()), (even_step, ()), (swap, ()), last, (swap, ()))
-        if pairs is not Pairs.PLAIN:
-            yield from self._updates_of_walls(DEFER_PART if pairs is Pairs.CORRECTED else 0.0)
-
-    def _updates_of_walls(self, part: float) -> Iterator[tuple[Launch, tuple[Any, ...]]]:
-        """Yield the kernels that bring populations home and update walls, with their under-relaxation factor.
-
-        The factor 0 leaves the walls as they are.
-        """
-        for launch in self._settle:
-            yield launch, (np.float32(part),)
-
-    def _launch_all(self, launches: Iterator[tuple[Launch, tuple[Any, ...]]]) -> None:
-        """Launch kernels one by one."""
-        for launch, further in launches:
-            launch(self.stream, *further)
+        if pairs is not Pairs.PLAIN:  # 0 brings populations home and leaves the walls as they are
+            part = np.float32(DEFER_PART if pairs is Pairs.CORRECTED else 0.0)
+            yield from ((launch, (part,)) for launch in self._settle)
 
     def rescale(self, state: State, stretch: float, stress: float) -> None:
         """Take links and screen of `state`, and convert populations to its time step (see `state.OnDevice`)."""
-        factor, f = np.float32(stretch), self._populations
-        stride, code_at = self._layout
-        everywhere = f, self._integers, stride, self._cells, code_at
-        of_links = f, self._integers, self._through
-        Launch(kernels.sent, len(state.links.address), of_links)(self.stream)
-        Launch(kernels.rescale, self._cells, everywhere)(self.stream, factor, np.float32(stress))
-        Launch(kernels.resend, len(state.links.address), of_links)(self.stream, factor)
+        sent, rescale, resend = self._lengthen
+        sent(self.stream)
+        rescale(self.stream, np.float32(stretch), np.float32(stress))
+        resend(self.stream, np.float32(stretch))
         self.stream.synchronize()
-        at, openings = self._at, self._openings()
+        places, openings = self._at.places, self._openings()
         openings[:, d3q19.OWN_DENSITIES] *= stretch**2
         for there, here in (
-            (self._doubles[at.opening], openings),
-            (self._singles[at.number], single_of(state)),
-            (self._singles[at.entry], state.screen.entry),
+            (self._doubles[places["openings"]], openings),
+            (self._singles[places["rates"]], rates_of(state)),
+            (self._singles[places["entries"]], state.screen.entry),
             (self._shape, state.links.shape),
-            (self._singles[at.correction], correction_of(state.links)),
+            (self._singles[places[kernels.CORRECTION]], correction_of(state.links)),
         ):
             if here.size:
                 there.copy_to_device(np.ascontiguousarray(here).reshape(there.shape))
-        self._launch_all(self._updates_of_walls(1.0))
+        for launch in self._settle:
+            launch(self.stream, np.float32(1.0))
 
     def read(self) -> tuple[NDArray[np.float32], NDArray[np.float32], Floats]:
         """Return density deviation (n,), momentum (n, 3), and the flow rate (k,) out of every end."""
         for launch in self._read:
             launch(self.stream)
-        density, velocity, outflow = self._moments.after(self.stream)
-        return density, velocity, outflow
+        density, velocity, through = self._moments.after(self.stream)
+        return density, velocity, np.add.reduceat(through, self._starts)
 
     def read_times(self) -> NDArray[np.float32]:
         """Return the relaxation times (e,) of shear-thinning blood in the cells of the screen."""
@@ -242,54 +205,27 @@ class Device:
         self._begun = 0
         self._populations.copy_to_host(state.populations)
         state.links.openings[:] = self._openings()
-        slot = self._packed.layout.slot
-        if len(slot):
-            link = self._singles[self._at.link].copy_to_host().reshape(-1, 2)
-            state.links.source[:] = link[slot, 1]
-            state.refill.refill[:] = self._singles[self._at.refill].copy_to_host()[self._packed.refilled]
+        places = self._at.places
+        link = self._singles[places[kernels.LINK]].copy_to_host().reshape(-1, 2)
+        state.links.source[:] = link[self._slot, 1]
+        state.refill.refill[:] = self._singles[places[kernels.REFILL]].copy_to_host()[self._at.refilled]
 
     def _openings(self) -> Floats:
         """Return `Links.openings` as they are on the GPU."""
-        return np.asarray(self._doubles[self._at.opening].copy_to_host()).reshape(-1, d3q19.OPENING)
-
-
-def _arrays(arguments: Sequence[Any]) -> Iterator[Any]:
-    """Yield the arrays among arguments and in their tuples."""
-    for argument in arguments:
-        if isinstance(argument, tuple):
-            yield from _arrays(argument)
-        elif hasattr(argument, "copy_to_host"):
-            yield argument
+        return np.asarray(self._doubles[self._at.places["openings"]].copy_to_host()).reshape(-1, d3q19.OPENING)
 
 
 def seconds_of_update(place: Ints, length: Ints, stride: int, relaxation: Sequence[Any]) -> float:
-    """Return the run time of an update of cells without walls, the best of several.
-
-    Shapes: `place` (s,), `length` (s,).
-    """
+    """Return the run time of an update of segments of cells (s,) without walls, the best of several."""
     time, law, limit, odd_rate = relaxation
-    rows, none = np.zeros((len(length), 9), np.int32), np.zeros(0, np.int32)
+    rows = np.zeros((len(length), 9), np.int32)
     rows[:, 0] = place - (np.cumsum(length) - length)
     code = np.repeat(np.arange(len(length), dtype=np.int32), length)
-    nothing = np.zeros(0, np.float32)
-    one, pairs = np.zeros(1, np.int32), np.zeros((6, 0), np.int32)
-    by_link = none, none, none > 0, pairs, pairs[:2], (one, none, one, none), none, none, none
-    layout = Layout(code, rows, none, pairs[:4], none, *by_link, one)
-    packed = Packed(layout, code, pairs, none, nothing.reshape(0, 2))
-    single = np.array([time, *law, odd_rate], np.float32)
-    numbers = Numbers(
-        single,
-        limit,
-        nothing,
-        np.zeros((0, d3q19.ENTRY), np.float32),
-        np.zeros((5, 0), np.float32),
-        np.zeros((0, d3q19.OPENING)),
-        np.zeros(1, np.int32),
-    )
-    at = tables(packed, numbers)
-    arrays = put(np.zeros(19 * stride, np.float32)), put(at.integers), put(at.singles), put(at.doubles)
-    cells = stride, len(code), at.code_at
-    launch = Launch(kernels.even_step, len(code), (*arrays, put(np.zeros((1, 0, 2))), *cells))
+    integers, places = joined({"head": np.zeros(kernels.HEAD), "rows": rows, "code": code}, np.int32)
+    singles, _ = joined({"rates": np.array([time, *law, odd_rate]), "limit": limit}, np.float32)
+    arrays = (put(array) for array in (np.zeros(19 * stride, np.float32), integers, singles, np.zeros(1)))
+    further = put(np.zeros((1, 0, 2))), stride, len(code), places["code"].start
+    launch = Launch(kernels.even_step, len(code), (*arrays, *further))
     times, stream = [], cuda.stream()
     for _ in range(UPDATES_TIMED):
         cuda.synchronize()
@@ -298,6 +234,37 @@ def seconds_of_update(place: Ints, length: Ints, stride: int, relaxation: Sequen
         cuda.synchronize()
         times.append(perf_counter() - began)
     return min(times)
+
+
+class ReadBack:
+    """Copies of some arrays of a GPU, through buffers on the host that are allocated at the first use."""
+
+    def __init__(self, arrays: tuple[Any, ...]) -> None:
+        """Keep the arrays of the GPU."""
+        self._arrays = arrays
+        self._buffers: tuple[NDArray[Any], ...] = ()
+        self._stream, self._written = cuda.stream(), cuda.event()
+        self._read = [cuda.event() for _ in arrays]
+
+    def after(self, stream: Any) -> Iterator[NDArray[Any]]:
+        """Yield each array as it is after what a stream has queued; later arrays are on their way meanwhile."""
+        self._buffers = self._buffers or tuple(_pinned(array) for array in self._arrays)
+        self._written.record(stream)
+        self._written.wait(self._stream)
+        for array, buffer, read in zip(self._arrays, self._buffers, self._read, strict=True):
+            array.copy_to_host(buffer, stream=self._stream)
+            read.record(self._stream)
+        for buffer, read in zip(self._buffers, self._read, strict=True):
+            read.synchronize()
+            yield buffer.copy()
+
+
+def _pinned(array: Any) -> NDArray[Any]:
+    """Return a buffer on the host for an array of the GPU; ordinary memory where the system pins no more."""
+    try:
+        return np.asarray(cuda.pinned_array(array.shape, array.dtype))
+    except Exception:  # noqa: BLE001 drivers and packages each have their own exception classes
+        return np.zeros(array.shape, array.dtype)
 
 
 def put(array: NDArray[Any]) -> Any:

@@ -53,15 +53,12 @@ SHIFT: Final = np.array([0, 0, 0, 0, 0, 1, -1, 0, 0, 0, 0, 1, -1, -1, 1, 1, -1, 
 ) = range(30)
 # fmt: on
 """Entries with which the integers begin; `gpu_tables` writes them."""
-HEAD: Final = 32
-"""Number of places kept for them, and for the numbers before the limits; `packing.LINE` is the same."""
+LINE: Final = 32
+"""Number of entries of 32 bits in a line of the memory. Every table begins on one; the limits are on the second."""
+HEAD: Final = LINE
+"""Number of places kept for these entries."""
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 _U, _WHOLE = np.uint64, np.uint32
-
-
-def _of_arrays(function: Any) -> Any:
-    """Return a function of arrays for use in a kernel: numba's simulator cannot pass its arrays to compiled code."""
-    return getattr(function, "py_func", function) if config.ENABLE_CUDASIM else function
 
 
 def _inlined(function: Callable[..., Any]) -> Any:
@@ -69,20 +66,30 @@ def _inlined(function: Callable[..., Any]) -> Any:
     return function if config.ENABLE_CUDASIM else njit(forceinline=True)(function)
 
 
-_between, _deferred = _of_arrays(d3q19.between), _of_arrays(d3q19.deferred)
-_answer, _outlet_source = _of_arrays(d3q19.answered), _of_arrays(d3q19.outlet_source)
+def _of_arrays(function: Any) -> Any:
+    """Return a function of arrays for use in a kernel: numba's simulator cannot pass its arrays to compiled code."""
+    return getattr(function, "py_func", function) if config.ENABLE_CUDASIM else function
+
+
+_answer, _balance, _between, _deferred, _outlet_source = (
+    _of_arrays(function)
+    for function in (d3q19.answered, d3q19.balance_group, d3q19.between, d3q19.deferred, d3q19.outlet_source)
+)
+
+
+def _unrolled(arguments: str, entry: str, numbers: range = range(19)) -> Any:
+    """Return a function with the tuple of `entry` for every direction q and its opposite p.
+
+    It is written out because a tuple indexed by a variable is kept in memory instead of registers.
+    """
+    entries = "".join(entry.format(q=q, p=OPPOSITE[q]) + ", " for q in numbers)
+    return _inlined(eval(f"lambda {arguments}: ({entries})", globals()))
 
 
 @_inlined
-def load(f: Any, address: int) -> Any:
-    """Return the population at an address; every kernel reads populations here."""
-    return f[_U(address)]
-
-
-@_inlined
-def _integer(integers: Any, at: int) -> Any:
-    """Return an entry of the integers."""
-    return integers[_U(at)]
+def load(array: Any, place: int) -> Any:
+    """Return an entry of an array; every kernel reads populations here."""
+    return array[_U(place)]
 
 
 @_inlined
@@ -98,33 +105,20 @@ def _cell(cell: int, integers: Any, code_at: int) -> tuple[int, int, int, int, i
     Links and entry are given by their places among the singles. A cell without them has no links, entry -1 and
     number -1.
     """
-    code = _integer(integers, code_at + cell)
+    code = load(integers, code_at + cell)
     if code >= 0:
         return code, 0, 0, 0, 0, -1, -1
     w = -1 - code
-    at, m = integers[SPECIAL] + w, integers[SPECIALS]
-    return (
-        _integer(integers, at),
-        _integer(integers, at + m),
-        _integer(integers, at + 2 * m),
-        _integer(integers, at + 3 * m),
-        _integer(integers, at + 4 * m),
-        _integer(integers, at + 5 * m),
-        w,
-    )
+    return *_special(integers, integers[SPECIAL] + w, integers[SPECIALS]), w
+
+
+_special = _unrolled("integers, at, specials", "load(integers, at + {q} * specials)", range(6))
 
 
 @_inlined
-def _place(integers: Any, s: int, cell: int) -> int:
-    """Return the storage place of a cell of segment `s`."""
-    place: int = _integer(integers, HEAD + 9 * s) + cell
-    return place
-
-
-@_inlined
-def _neighbour(q: int, integers: Any, s: int, cell: int) -> int:
-    """Return the storage place of the neighbour in direction `q` of a cell of segment `s`."""
-    place: int = _integer(integers, HEAD + 9 * s + COLUMN[q]) + cell + SHIFT[q]
+def _place(q: int, integers: Any, s: int, cell: int) -> int:
+    """Return the storage place of the neighbour in direction `q` of a cell of segment `s`; 0: of the cell itself."""
+    place: int = load(integers, HEAD + 9 * s + COLUMN[q]) + cell + SHIFT[q]
     return place
 
 
@@ -138,138 +132,21 @@ def _own(q: int, stride: int, place: int) -> Any:
 def _away(q: int, stride: int, integers: Any, s: int, cell: int, links: int) -> Any:
     """Return the address of population `q` of a cell in an odd step: at the neighbour, or at home behind a link."""
     p = OPPOSITE[q]
-    if links & (1 << p):
-        return _own(q, stride, _place(integers, s, cell))
-    return _WHOLE(p * stride + _neighbour(p, integers, s, cell))
+    if q == 0 or links & (1 << p):
+        return _own(q, stride, _place(0, integers, s, cell))
+    return _own(p, stride, _place(p, integers, s, cell))
 
 
-@_inlined
-def _homes(stride: int, place: int) -> tuple[Any, ...]:
-    """Return the addresses (19) of a cell's populations in an even step."""
-    return (
-        _own(0, stride, place),
-        _own(1, stride, place),
-        _own(2, stride, place),
-        _own(3, stride, place),
-        _own(4, stride, place),
-        _own(5, stride, place),
-        _own(6, stride, place),
-        _own(7, stride, place),
-        _own(8, stride, place),
-        _own(9, stride, place),
-        _own(10, stride, place),
-        _own(11, stride, place),
-        _own(12, stride, place),
-        _own(13, stride, place),
-        _own(14, stride, place),
-        _own(15, stride, place),
-        _own(16, stride, place),
-        _own(17, stride, place),
-        _own(18, stride, place),
-    )
-
-
-@_inlined
-def _aways(stride: int, integers: Any, s: int, cell: int, links: int) -> tuple[Any, ...]:
-    """Return the addresses (19) of a cell's populations in an odd step."""
-    return (
-        _own(0, stride, _place(integers, s, cell)),
-        _away(1, stride, integers, s, cell, links),
-        _away(2, stride, integers, s, cell, links),
-        _away(3, stride, integers, s, cell, links),
-        _away(4, stride, integers, s, cell, links),
-        _away(5, stride, integers, s, cell, links),
-        _away(6, stride, integers, s, cell, links),
-        _away(7, stride, integers, s, cell, links),
-        _away(8, stride, integers, s, cell, links),
-        _away(9, stride, integers, s, cell, links),
-        _away(10, stride, integers, s, cell, links),
-        _away(11, stride, integers, s, cell, links),
-        _away(12, stride, integers, s, cell, links),
-        _away(13, stride, integers, s, cell, links),
-        _away(14, stride, integers, s, cell, links),
-        _away(15, stride, integers, s, cell, links),
-        _away(16, stride, integers, s, cell, links),
-        _away(17, stride, integers, s, cell, links),
-        _away(18, stride, integers, s, cell, links),
-    )
-
-
-@_inlined
-def _loaded(f: Any, at: tuple[int, ...]) -> tuple[Any, ...]:
-    """Return the populations (19) at addresses (19)."""
-    return (
-        load(f, at[0]),
-        load(f, at[1]),
-        load(f, at[2]),
-        load(f, at[3]),
-        load(f, at[4]),
-        load(f, at[5]),
-        load(f, at[6]),
-        load(f, at[7]),
-        load(f, at[8]),
-        load(f, at[9]),
-        load(f, at[10]),
-        load(f, at[11]),
-        load(f, at[12]),
-        load(f, at[13]),
-        load(f, at[14]),
-        load(f, at[15]),
-        load(f, at[16]),
-        load(f, at[17]),
-        load(f, at[18]),
-    )
-
-
-@_inlined
-def _stored(f: Any, at: tuple[int, ...], new: tuple[Any, ...]) -> None:
-    """Write populations (19) to addresses (19)."""
-    store(f, at[0], new[0])
-    store(f, at[1], new[1])
-    store(f, at[2], new[2])
-    store(f, at[3], new[3])
-    store(f, at[4], new[4])
-    store(f, at[5], new[5])
-    store(f, at[6], new[6])
-    store(f, at[7], new[7])
-    store(f, at[8], new[8])
-    store(f, at[9], new[9])
-    store(f, at[10], new[10])
-    store(f, at[11], new[11])
-    store(f, at[12], new[12])
-    store(f, at[13], new[13])
-    store(f, at[14], new[14])
-    store(f, at[15], new[15])
-    store(f, at[16], new[16])
-    store(f, at[17], new[17])
-    store(f, at[18], new[18])
-
-
-@_inlined
-def _stored_away(f: Any, stride: int, integers: Any, s: int, cell: int, links: int, new: tuple[Any, ...]) -> None:
-    """Write populations (19) to the addresses of an odd step.
-
-    Addresses are computed again, because registers that hold them would be too few for the collision.
-    """
-    store(f, _own(0, stride, _place(integers, s, cell)), new[0])
-    store(f, _away(1, stride, integers, s, cell, links), new[1])
-    store(f, _away(2, stride, integers, s, cell, links), new[2])
-    store(f, _away(3, stride, integers, s, cell, links), new[3])
-    store(f, _away(4, stride, integers, s, cell, links), new[4])
-    store(f, _away(5, stride, integers, s, cell, links), new[5])
-    store(f, _away(6, stride, integers, s, cell, links), new[6])
-    store(f, _away(7, stride, integers, s, cell, links), new[7])
-    store(f, _away(8, stride, integers, s, cell, links), new[8])
-    store(f, _away(9, stride, integers, s, cell, links), new[9])
-    store(f, _away(10, stride, integers, s, cell, links), new[10])
-    store(f, _away(11, stride, integers, s, cell, links), new[11])
-    store(f, _away(12, stride, integers, s, cell, links), new[12])
-    store(f, _away(13, stride, integers, s, cell, links), new[13])
-    store(f, _away(14, stride, integers, s, cell, links), new[14])
-    store(f, _away(15, stride, integers, s, cell, links), new[15])
-    store(f, _away(16, stride, integers, s, cell, links), new[16])
-    store(f, _away(17, stride, integers, s, cell, links), new[17])
-    store(f, _away(18, stride, integers, s, cell, links), new[18])
+_homes = _unrolled("stride, place", "_own({q}, stride, place)")
+_aways = _unrolled("stride, integers, s, cell, links", "_away({q}, stride, integers, s, cell, links)")
+_loaded = _unrolled("f, at", "load(f, at[{q}])")
+_stored = _unrolled("f, at, new", "store(f, at[{q}], new[{q}])")
+_stored_swapped = _unrolled("f, at, new", "store(f, at[{q}], new[{p}])")
+# Addresses are computed again, because registers that hold them would be too few for the collision.
+_stored_away = _unrolled(
+    "f, stride, integers, s, cell, links, new",
+    "store(f, _away({q}, stride, integers, s, cell, links), new[{q}])",
+)
 
 
 @_inlined
@@ -279,49 +156,32 @@ def _link(q: int, links: int, first: int) -> int:
 
 
 @_inlined
+def _mixed(n: int, sent: Any, beside: Any, singles: Any) -> Any:
+    """Return what the link with its weight at `n` returns for the population sent."""
+    weight = load(singles, n)
+    return weight * sent + (_ONE - abs(weight)) * beside + load(singles, n + 1)
+
+
+@_inlined
 def _returned(q: int, sent: Any, beside: Any, which: int, links: int, first: int, singles: Any) -> Any:
     """Return what the link in direction `q` returns for the population sent, or `sent` where it is not in `which`."""
-    if not which & (1 << q):
+    if q == 0 or not which & (1 << q):
         return sent
-    n = _link(q, links, first)
-    weight = singles[_U(n)]
-    return weight * sent + (_ONE - abs(weight)) * beside + singles[_U(n + 1)]
+    return _mixed(_link(q, links, first), sent, beside, singles)
 
 
-@_inlined
-def _returned_pair(q: int, a: Any, b: Any, which: int, links: int, first: int, singles: Any) -> tuple[Any, Any]:
-    """Return populations `q` and `q` + 1 after the links of this pair of opposite directions (see `_reflected`)."""
-    return (
-        _returned(q + 1, a, b, which, links, first, singles),
-        _returned(q, b, a, which, links, first, singles),
-    )
-
-
-@_inlined
-def _reflected(f: tuple[Any, ...], which: int, links: int, first: int, singles: Any) -> tuple[Any, ...]:
-    """Return the populations (19) of a cell after the links in the mask `which`.
-
-    What was sent along a link is in the place of the opposite direction.
-    """
-    return (
-        f[0],
-        *_returned_pair(1, f[1], f[2], which, links, first, singles),
-        *_returned_pair(3, f[3], f[4], which, links, first, singles),
-        *_returned_pair(5, f[5], f[6], which, links, first, singles),
-        *_returned_pair(7, f[7], f[8], which, links, first, singles),
-        *_returned_pair(9, f[9], f[10], which, links, first, singles),
-        *_returned_pair(11, f[11], f[12], which, links, first, singles),
-        *_returned_pair(13, f[13], f[14], which, links, first, singles),
-        *_returned_pair(15, f[15], f[16], which, links, first, singles),
-        *_returned_pair(17, f[17], f[18], which, links, first, singles),
-    )
+# The populations (19) of a cell after the links in the mask `which`. What was sent along a link is in the place of the
+# opposite direction.
+_reflected = _unrolled(
+    "f, which, links, first, singles", "_returned({p}, f[{q}], f[{p}], which, links, first, singles)"
+)
 
 
 @_inlined
 def _present(f: Any, integers: Any, singles: Any, stride: int, code_at: int, cell: int) -> tuple[Any, ...]:
     """Return the populations (19) of a cell between two pairs of steps, whether they are at home or not."""
     s, links, near, _, first, _, _ = _cell(cell, integers, code_at)
-    held = _loaded(f, _homes(stride, _place(integers, s, cell)))
+    held: tuple[Any, ...] = _loaded(f, _homes(stride, _place(0, integers, s, cell)))
     if near and not integers[AT_HOME]:
         held = _reflected(held, near, links, first, singles)
     return held
@@ -329,11 +189,8 @@ def _present(f: Any, integers: Any, singles: Any, stride: int, code_at: int, cel
 
 @_inlined
 def _collided(held: tuple[Any, ...], singles: Any, s: int, e: int) -> tuple[Any, ...]:
-    """Return the collided populations (19) of a cell of segment `s`, each in the place of its opposite.
-
-    `e` is the place of its screen entry, or -1.
-    """
-    time, odd_rate, limit = singles[0], singles[5], singles[_U(HEAD + s)]
+    """Return the collided populations (19) of a cell, each in the place of its opposite; `e`: its entry, or -1."""
+    time, odd_rate, limit = singles[0], singles[5], load(singles, LINE + s)
     law = singles[1], singles[2], singles[3], singles[4]
     if law[0] > _ZERO:
         time = thinned(stress_size(held), time, law)
@@ -347,15 +204,13 @@ def _collided(held: tuple[Any, ...], singles: Any, s: int, e: int) -> tuple[Any,
 
 
 @_inlined
-def _left(
-    new: tuple[Any, ...], far: int, links: int, first: int, w: int, integers: Any, singles: Any
-) -> tuple[Any, ...]:
+def _left(new: Any, far: int, links: int, first: int, w: int, integers: Any, singles: Any) -> tuple[Any, ...]:
     """Return the populations (19) to be stored: after the links in the mask `far`, with the refill of special cells."""
     if far:
         new = _reflected(new, far, links, first, singles)
     rest = new[0]
     if w >= 0:
-        rest += singles[_U(integers[REFILL] + w)]
+        rest += load(singles, integers[REFILL] + w)
     return rest, *new[1:]
 
 
@@ -378,9 +233,7 @@ def _density(f: tuple[Any, ...]) -> float:
 
 
 @_inlined
-def _open(
-    held: tuple[Any, ...], ends: int, links: int, first: int, integers: Any, singles: Any, doubles: Any, shape: Any
-) -> None:
+def _open(held: Any, ends: int, links: int, first: int, integers: Any, singles: Any, doubles: Any, shape: Any) -> None:
     """Set the sources of a cell's links in the mask `ends` (see `d3q19.drive`)."""
     velocity = _velocity(held)
     openings, answer = integers[OPENINGS], integers[ANSWER]
@@ -420,7 +273,7 @@ def even_step(
     if cell >= cells:
         return
     s, links, near, ends, first, e, w = _cell(cell, integers, code_at)
-    at = _homes(stride, _place(integers, s, cell))
+    at = _homes(stride, _place(0, integers, s, cell))
     held = _loaded(f, at)
     if near and not integers[AT_HOME]:
         held = _reflected(held, near, links, first, singles)
@@ -457,30 +310,14 @@ def odd_step(f: Any, integers: Any, singles: Any, stride: int, cells: int, code_
 def _send_one(f: Any, q: int, population: Any, which: int, stride: int, integers: Any, s: int, cell: int) -> None:
     """Write what is sent along the link in direction `q` to its mailbox, if it is in the mask `which`."""
     if which & (1 << q):
-        store(f, q * stride + _neighbour(q, integers, s, cell), population)
+        store(f, q * stride + _place(q, integers, s, cell), population)
 
 
-@_inlined
-def _send(f: Any, new: tuple[Any, ...], which: int, stride: int, integers: Any, s: int, cell: int) -> None:
-    """Write what is sent along the links in the mask `which` to their mailboxes."""
-    _send_one(f, 1, new[2], which, stride, integers, s, cell)
-    _send_one(f, 2, new[1], which, stride, integers, s, cell)
-    _send_one(f, 3, new[4], which, stride, integers, s, cell)
-    _send_one(f, 4, new[3], which, stride, integers, s, cell)
-    _send_one(f, 5, new[6], which, stride, integers, s, cell)
-    _send_one(f, 6, new[5], which, stride, integers, s, cell)
-    _send_one(f, 7, new[8], which, stride, integers, s, cell)
-    _send_one(f, 8, new[7], which, stride, integers, s, cell)
-    _send_one(f, 9, new[10], which, stride, integers, s, cell)
-    _send_one(f, 10, new[9], which, stride, integers, s, cell)
-    _send_one(f, 11, new[12], which, stride, integers, s, cell)
-    _send_one(f, 12, new[11], which, stride, integers, s, cell)
-    _send_one(f, 13, new[14], which, stride, integers, s, cell)
-    _send_one(f, 14, new[13], which, stride, integers, s, cell)
-    _send_one(f, 15, new[16], which, stride, integers, s, cell)
-    _send_one(f, 16, new[15], which, stride, integers, s, cell)
-    _send_one(f, 17, new[18], which, stride, integers, s, cell)
-    _send_one(f, 18, new[17], which, stride, integers, s, cell)
+_send = _unrolled(
+    "f, new, which, stride, integers, s, cell",
+    "_send_one(f, {q}, new[{p}], which, stride, integers, s, cell)",
+    range(1, 19),
+)
 
 
 @cuda.jit(cache=True)
@@ -489,7 +326,7 @@ def swap(f: Any, integers: Any) -> None:
     k, count = cuda.grid(1), integers[SEPTUM_COUNT]
     if k < count:
         at = integers[SEPTA] + k
-        one, other = _integer(integers, at), _integer(integers, at + count)
+        one, other = load(integers, at), load(integers, at + count)
         first, second = load(f, one), load(f, other)
         store(f, one, second)
         store(f, other, first)
@@ -498,78 +335,48 @@ def swap(f: Any, integers: Any) -> None:
 @_inlined
 def _at_link(column: int, k: int, integers: Any) -> int:
     """Return an entry of `Links.address` for link `k`."""
-    address: int = _integer(integers, integers[ADDRESS] + column * integers[LINKS] + k)
+    address: int = load(integers, integers[ADDRESS] + column * integers[LINKS] + k)
     return address
+
+
+_correction = _unrolled("singles, at, walls", "singles[at + {q} * walls]", range(5))
 
 
 @cuda.jit(cache=True)
 def defer(f: Any, integers: Any, singles: Any, part: float) -> None:
-    """Bring the populations of wall links home, and move their sources towards higher-order interpolation.
+    """Bring the populations of wall links home, and move their sources as `d3q19.defer` does; not where `part` is 0.
 
-    The last odd step must have kept them. Where `part` is 0 the sources stay as they are.
-
-    Parameters
-    ----------
-    f, part : as in `d3q19.defer`.
-    integers, singles : as in `even_step`. Further integers: `Links.address` (6, l), and the number of each link of the
-        walls in `Packed.link`, or -1 minus this number for a near link. Further singles: the mass lost (walls,), and
-        `Links.correction` of the walls (5, walls).
+    The last odd step must have kept them.
     """
     w, walls = cuda.grid(1), integers[WALLS]
     if w >= walls:
         return
-    number, k = _integer(integers, integers[SLOT] + w), integers[LINKS] - walls + w
-    home, sent = _at_link(0, k, integers), load(f, _at_link(3, k, integers))
+    number, k = load(integers, integers[SLOT] + w), integers[LINKS] - walls + w
+    home, sent, beside = _at_link(0, k, integers), load(f, _at_link(3, k, integers)), load(f, _at_link(2, k, integers))
     is_near = number < 0
     n = integers[LINK] + 2 * (-1 - number if is_near else number)
     if is_near and not integers[AT_HOME]:
-        weight = singles[n]
-        beside = load(f, _at_link(2, k, integers))
-        store(f, home, weight * sent + (_ONE - abs(weight)) * beside + singles[n + 1])
+        store(f, home, _mixed(n, sent, beside, singles))
     singles[integers[LOST] + w] = sent - load(f, home)
-    held = (
-        sent,
-        load(f, _at_link(2, k, integers)),
-        load(f, _at_link(1, k, integers)),
-        load(f, _at_link(5, k, integers)),
-        load(f, _at_link(4, k, integers)),
-    )
-    at = integers[CORRECTION] + w
-    weights = (
-        singles[at],
-        singles[at + walls],
-        singles[at + 2 * walls],
-        singles[at + 3 * walls],
-        singles[at + 4 * walls],
-    )
-    singles[n + 1] += part * (_deferred(held, weights) - singles[n + 1])
+    behind, further, back = _at_link(1, k, integers), _at_link(5, k, integers), _at_link(4, k, integers)
+    held = sent, beside, load(f, behind), load(f, further), load(f, back)
+    singles[n + 1] += part * (_deferred(held, _correction(singles, integers[CORRECTION] + w, walls)) - singles[n + 1])
 
 
 @cuda.jit(cache=True)
 def balance(integers: Any, singles: Any, part: float) -> None:
     """Move the refill towards the mass lost at the walls, one thread per group of wall cells (see `d3q19.balance`).
 
-    It follows `defer`; populations are at home from here on, which the clock keeps.
-
-    Parameters
-    ----------
-    integers, singles : as in `defer`. Further integers: `Refill.groups`, whose cells are numbers of special cells.
-    part : as in `d3q19.balance`.
+    It follows `defer`; populations are at home from here on, which the clock keeps. Members of the groups are numbers
+    of special cells.
     """
     g = cuda.grid(1)
     if g == 0:
         integers[AT_HOME] = 1
-    if g >= integers[GROUPS]:
-        return
-    links, members = integers[FIRST_LINK] + g, integers[FIRST_MEMBER] + g
-    total = 0.0
-    for i in range(_integer(integers, links), _integer(integers, links + 1)):
-        total += float(singles[_U(integers[LOST] + _integer(integers, integers[GROUP_LINK] + i))])
-    first, last = _integer(integers, members), _integer(integers, members + 1)
-    share = total / (last - first)
-    for i in range(first, last):
-        n = _U(integers[REFILL] + _integer(integers, integers[GROUP_MEMBER] + i))
-        singles[n] += part * (share - singles[n])
+    if g < integers[GROUPS]:
+        of_links = integers[integers[FIRST_LINK] :], integers[integers[GROUP_LINK] :]
+        groups = *of_links, integers[integers[FIRST_MEMBER] :], integers[integers[GROUP_MEMBER] :]
+        _balance(g, singles[integers[LOST] :], groups, singles[integers[REFILL] :], part)
 
 
 @cuda.jit(cache=True)
@@ -594,10 +401,10 @@ def times(f: Any, integers: Any, singles: Any, stride: int, code_at: int, cell: 
 
 @cuda.jit(cache=True)
 def sent(f: Any, integers: Any, through: Any) -> None:
-    """Write the flow (l,) through every link; populations must be at home. Integers as in `defer`."""
+    """Write the flow (l,) through the first links; populations must be at home. Integers as in `even_step`."""
     k = cuda.grid(1)
-    if k < integers[LINKS]:
-        through[k] = load(f, _at_link(3, k, integers)) - load(f, _at_link(0, k, integers))
+    if k < through.size:
+        through[k] = float(load(f, _at_link(3, k, integers))) - float(load(f, _at_link(0, k, integers)))
 
 
 @cuda.jit(cache=True)
@@ -613,21 +420,14 @@ def rescale(f: Any, integers: Any, stride: int, cells: int, code_at: int, stretc
     """Convert the populations to time steps `stretch` times as long; they must be at home (see `d3q19.rescale`)."""
     cell = cuda.grid(1)
     if cell < cells:
-        at = _homes(stride, _place(integers, _cell(cell, integers, code_at)[0], cell))
-        new = rescaled(_loaded(f, at), stretch, stress)
-        _stored(f, at, _unswapped(new))
+        at = _homes(stride, _place(0, integers, _cell(cell, integers, code_at)[0], cell))
+        _stored_swapped(f, at, rescaled(_loaded(f, at), stretch, stress))
 
 
 @_inlined
-def _unswapped(new: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return populations (19) that are in the places of their opposites in their own places."""
-    first = new[0], new[2], new[1], new[4], new[3], new[6], new[5], new[8], new[7], new[10], new[9]
-    return *first, new[12], new[11], new[14], new[13], new[16], new[15], new[18], new[17]
-
-
-@_inlined
-def _sum(parts: Any, t: int) -> float:
-    """Return the sum of a value of each of a block's threads, in fixed order; every thread must call it."""
+def _sum(parts: Any, t: int, part: float) -> float:
+    """Return the sum of the parts of a block's threads, in fixed order; every thread must call it."""
+    parts[t] = part
     cuda.syncthreads()
     half = THREADS // 2
     while half > 0:
@@ -642,45 +442,23 @@ def _sum(parts: Any, t: int) -> float:
 
 @_inlined
 def _of_opening(
-    f: Any, integers: Any, singles: Any, stride: int, code_at: int, cell: int, k: int, is_flow: bool
+    f: Any, integers: Any, singles: Any, stride: int, code_at: int, cell: int, k: int, kind: float
 ) -> float:
-    """Return a cell's part of the flow rate out of opening `k`, or of the sum of density over its links."""
+    """Return a cell's part of the flow rate out of opening `k`; of an inflow, of the sum of density over its links."""
     s, links, _, mask, first, _, _ = _cell(cell, integers, code_at)
     opening_at = integers[OPENING_OF_END]
     density, total = 0.0, 0.0
-    if not is_flow:
+    if kind == INFLOW:
         density = _density(_present(f, integers, singles, stride, code_at, cell))
     for q in range(1, 19):
         if mask & (1 << q) and integers[opening_at + _end(_link(q, links, first), integers)] == k:
-            if is_flow:
-                out = load(f, q * stride + _neighbour(q, integers, s, cell))
-                back = load(f, _own(OPPOSITE[q], stride, _place(integers, s, cell)))
-                total += float(out) - float(back)
-            else:
+            if kind == INFLOW:
                 total += density
+            else:
+                out = load(f, q * stride + _place(q, integers, s, cell))
+                back = load(f, _own(OPPOSITE[q], stride, _place(0, integers, s, cell)))
+                total += float(out) - float(back)
     return total
-
-
-@cuda.jit(cache=True)
-def outflow(
-    f: Any, integers: Any, singles: Any, stride: int, code_at: int, end_cell: Any, start: Any, result: Any
-) -> None:
-    """Write the flow rate (k,) out of every opening, one block each (see `d3q19.outflow`).
-
-    Parameters
-    ----------
-    f, integers, singles, stride, code_at : as in `even_step`.
-    end_cell, start : `Layout.end_cell` and `Layout.end_cell_start`.
-    """
-    k, t = cuda.blockIdx.x, cuda.threadIdx.x
-    parts = cuda.shared.array(THREADS, np.float64)
-    total = 0.0
-    for i in range(start[k] + t, start[k + 1], THREADS):
-        total += _of_opening(f, integers, singles, stride, code_at, end_cell[i], k, True)
-    parts[t] = total
-    total = _sum(parts, t)
-    if t == 0:
-        result[k] = total
 
 
 @cuda.jit(cache=True)
@@ -694,14 +472,13 @@ def drive(f: Any, integers: Any, singles: Any, doubles: Any, stride: int, code_a
     block = integers[BLOCKS] + 3 * b
     k, i, end = integers[block], integers[block + 1] + t, integers[block + 2]
     first, last = integers[integers[FIRST_BLOCK] + k], integers[integers[FIRST_BLOCK] + k + 1]
-    kind, part = doubles[OPENING * k + KIND], integers[PARTS]
+    opening, part = doubles[OPENING * k : OPENING * (k + 1)], integers[PARTS]
     parts, is_last = cuda.shared.array(THREADS, np.float64), cuda.shared.array(1, np.int32)
     total = 0.0
-    if i < end and kind != PRESSURE:  # its answer depends on nothing
+    if i < end and opening[KIND] != PRESSURE:  # its answer depends on nothing
         cell = integers[integers[END_CELL] + i]
-        total = _of_opening(f, integers, singles, stride, code_at, cell, k, kind != INFLOW)
-    parts[t] = total
-    total = _sum(parts, t)
+        total = _of_opening(f, integers, singles, stride, code_at, cell, k, opening[KIND])
+    total = _sum(parts, t, total)
     if t == 0:
         doubles[part + b] = total
         cuda.threadfence()
@@ -713,18 +490,10 @@ def drive(f: Any, integers: Any, singles: Any, doubles: Any, stride: int, code_a
     total = 0.0
     for other in range(first + t, last, THREADS):
         total += doubles[part + other]
-    parts[t] = total
-    total = _sum(parts, t)
+    total = _sum(parts, t, total)
     if t == 0:
         integers[integers[DONE] + k] = 0
-        _answered(k, total, integers, doubles)
-
-
-@_inlined
-def _answered(k: int, total: float, integers: Any, doubles: Any) -> None:
-    """Write the answer of opening `k` to the flow rate out of it or the sum of density over its links."""
-    opening, answer = doubles[OPENING * k : OPENING * (k + 1)], integers[ANSWER] + k
-    opening[WANTED] = doubles[integers[IMPOSED] + integers[NOW] * (integers[OPENINGS] + 3) + k]
-    if opening[KIND] == INFLOW:
-        total /= integers[integers[COUNT] + k]
-    doubles[answer] = _answer(opening, total)
+        opening[WANTED] = doubles[integers[IMPOSED] + integers[NOW] * (integers[OPENINGS] + 3) + k]
+        if opening[KIND] == INFLOW:
+            total /= integers[integers[COUNT] + k]
+        doubles[integers[ANSWER] + k] = _answer(opening, total)
