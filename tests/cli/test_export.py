@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from foam_dictionary import parse
 from shapes import sphere
 
 from vstent import phantoms
 from vstent.cli import main
 from vstent.devices.treatment import with_device
-from vstent.flow.openfoam.dictionary import parse
 from vstent.geometry.surface import Surface
 from vstent.io.surfaces import read_surface
 from vstent.io.vtk_reader import read_mesh

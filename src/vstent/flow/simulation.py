@@ -15,7 +15,7 @@ from vstent import plugins
 from vstent.devices.stent import Deployment
 from vstent.errors import InputError
 from vstent.flow import sampling
-from vstent.flow.beside import Beside
+from vstent.flow.background import BackgroundWork
 from vstent.flow.case import FlowCase, FlowField, Level, Phase, Target
 from vstent.flow.domain import MIN_CELLS, CoarseGridError, default_cell_size_mm
 from vstent.flow.engines import AbstractEngine, Bookmark, DivergenceError, Progress, Saved, run
@@ -318,8 +318,8 @@ def _guessed(engine: AbstractEngine[Any], case: FlowCase, guess: Guess) -> FlowF
     """Return a first guess; while a GPU computes it, what the engine needs next is built."""
     if not case.numerics.device_gpu:
         return guess()
-    with Beside(case.numerics) as beside:
-        ready = beside.do(partial(engine.prepare, case))
+    with BackgroundWork(case.numerics) as background:
+        ready = background.begin(partial(engine.prepare, case))
         found = guess()
         ready()
     return found

@@ -11,7 +11,7 @@ from vstent.angiography.curves import retention_s
 from vstent.deployment.deploy import deploy, propose_landing
 from vstent.devices.stent import Landing, Stent
 from vstent.errors import FlowError, InputError
-from vstent.flow.beside import Beside
+from vstent.flow.background import BackgroundWork
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.grade import NOT_USABLE, grade
 from vstent.flow.indices import indices
@@ -101,13 +101,13 @@ def rank_flows(
     flows = _Flows(anatomy, settings, has_contrast, [coverage_of(one) for one in unfinished])
     waiting: dict[Candidate | None, Callable[[], Mapping[str, Any]]] = {}
     criteria = ranking.criteria if has_contrast else None
-    with Beside(settings.numerics) as beside:
+    with BackgroundWork(settings.numerics) as background:
         for done, candidate in enumerate([None, *chosen]):
             if progress is not None:
                 progress(done, 1 + len(chosen), "no device" if candidate is None else candidate.label)
             result = found.get(candidate)
             if result is None or candidate in unfinished or (candidate is None and unfinished):
-                waiting[candidate] = beside.do(partial(_stored, found, candidate, flows.computed(candidate)))
+                waiting[candidate] = background.begin(partial(_stored, found, candidate, flows.computed(candidate)))
             else:
                 waiting[candidate] = partial(_itself, result)
     results = {candidate: wait() for candidate, wait in waiting.items()}

@@ -14,9 +14,10 @@ from vstent.flow.case import FlowCase
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.openfoam import program
 from vstent.flow.openfoam.case import FoamCase, foam_case, strut_solids
+from vstent.flow.openfoam.dialects import Flavour
 from vstent.flow.openfoam.folder import write
 from vstent.flow.openfoam.patches import named_patches, stl_text
-from vstent.flow.openfoam.setup import Flavour, FoamSetup
+from vstent.flow.openfoam.setup import FoamSetup
 from vstent.flow.problem import flow_case
 from vstent.geometry.vessel import Anatomy
 from vstent.io import writers

@@ -24,7 +24,7 @@ from vstent.devices.ranges import how_sure
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.devices.treatment import BARE, Implant, Treatment
 from vstent.errors import DeviceError, FlowError, InputError, LandingError, ReadError, VstentError
-from vstent.flow.beside import Beside
+from vstent.flow.background import BackgroundWork
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.convergence import Sensitivity, convergence
 from vstent.flow.grade import computation_of, grade
@@ -329,7 +329,7 @@ def compute_flows(
     folders, stored = engine_folders(out, settings), []
     stents = {BARE: [], **{name: [one.stent for one in found.values()] for name, found in implants.items()}}
     names = (BARE, *(one.name for one in settings.treatments if one.has_flow and one.name in implants))
-    with Beside(settings.flow.numerics) as beside:
+    with BackgroundWork(settings.flow.numerics) as background:
         for name in names:
             stage, keep = f"flow {name}", None
             field = store.find(stage, keys[stage], FlowField)
@@ -356,7 +356,7 @@ def compute_flows(
                     continue
                 keep = store.keeping(stage, keys[stage], field)
             fields[name] = field
-            stored.append(beside.do(partial(_keep, keep, flow_folder(out, name), field)))
+            stored.append(background.begin(partial(_keep, keep, flow_folder(out, name), field)))
     for done in stored:
         done()
     return fields, failures

@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from foam_dictionary import parse
 from shapes import sphere
 from tubes import line, tube, with_neck
 
@@ -14,12 +15,12 @@ from vstent.anatomy.trace import trace
 from vstent.deployment.deploy import deploy
 from vstent.deployment.struts import struts
 from vstent.devices.catalogue import find_design
-from vstent.errors import FlowError, LandingError, ReadError
+from vstent.errors import FlowError, LandingError
 from vstent.flow.case import FlowCase, Target
 from vstent.flow.openfoam.case import foam_case, strut_solids
 from vstent.flow.openfoam.control import fluid
 from vstent.flow.openfoam.cost import tell_cost
-from vstent.flow.openfoam.dictionary import foam_file, parse
+from vstent.flow.openfoam.dictionary import foam_file
 from vstent.flow.openfoam.patches import named_patches
 from vstent.flow.openfoam.setup import FoamSetup
 from vstent.flow.problem import flow_case, vessel_case
@@ -111,7 +112,7 @@ def test_what_is_written_is_read_and_what_is_damaged_is_refused() -> None:
     assert entries["a_key_of_more_than_sixteen"] == ["1.5"]
     assert entries["b"] == {"c": ["(", "d", "(", "1", "2", ")", ")"], "e": ["yes"]}
     for damaged in (text.replace("1.5;", "1.5"), text[:-2], text + "}"):
-        with pytest.raises(ReadError):
+        with pytest.raises(ValueError, match="OpenFOAM dictionary"):
             parse(damaged)
 
 
@@ -262,7 +263,6 @@ def test_two_cells_lie_across_a_strut_and_no_more_than_twice_as_many(name: str, 
     setup = FoamSetup(0.25, struts=struts(deploy(find_design(name), anatomy).stent))
     cell_mm = 0.25 / 2**setup.levels_at_struts
     assert across_mm[0] / 5 < cell_mm < across_mm[1] / 2
-    assert replace(setup, strut_levels=1).levels_at_struts == 1
     assert FoamSetup(0.25).levels_at_struts == 0
 
 

@@ -23,8 +23,9 @@ from vstent.flow.engines import Outcome, Progress, run
 from vstent.flow.openfoam import folder as folders
 from vstent.flow.openfoam import program, results, scatter
 from vstent.flow.openfoam.bridge import Snapshot, bridge
+from vstent.flow.openfoam.dialects import Flavour
 from vstent.flow.openfoam.engine import OpenFoam, State, mean_magnitudes
-from vstent.flow.openfoam.setup import Flavour, FoamSetup
+from vstent.flow.openfoam.setup import FoamSetup
 from vstent.flow.problem import flow_case, vessel_case
 from vstent.flow.settings import FlowSettings, Numerics, Waveform
 from vstent.flow.simulation import simulate_case

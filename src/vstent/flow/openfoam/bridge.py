@@ -67,13 +67,7 @@ class Snapshot:
 
 
 def bridge(case: FlowCase, domain: Domain, folder: Path) -> Bridge:
-    """Build the interpolation matrices of a meshed case.
-
-    Raises
-    ------
-    ReadError
-        The cell centres are missing or damaged.
-    """
+    """Build the interpolation matrices of a meshed case."""
     centers = results.read_field(folder, "0", "C")
     inside_mm = centers.inside / M_PER_MM
     at_rest = {name: centers.patches[name] / M_PER_MM for name in ("wall", "sac", STRUTS) if name in centers.patches}
@@ -82,50 +76,31 @@ def bridge(case: FlowCase, domain: Domain, folder: Path) -> Bridge:
     ostium_mm, area_mm2 = np.zeros((0, 3)), np.zeros((0, 3))
     if case.ostium is not None:
         ostium_mm, area_mm2 = sampling.surface_samples(case.ostium, OSTIUM_SPACING * domain.cell_size_mm)
-    lumen = case.vessel.lumen
+    lumen, reach_mm = case.vessel.lumen, 2 * domain.cell_size_mm
+    wall_mm = np.concatenate(list(at_rest.values()))
+    # Positions with normals, so that a vertex has no part of a wall back to back with its own.
+    facing = np.hstack([wall_mm, reach_mm * lumen.normals[lumen.closest(wall_mm)[2]]])
     return Bridge(
         scatter.fits(known_mm, domain.centers_mm),
         scatter.fits(inside_mm, domain.centers_mm),
         scatter.fits(known_mm, ostium_mm),
         area_mm2,
-        _wall_to_lumen(case, np.concatenate(list(at_rest.values())), 2 * domain.cell_size_mm),
+        scatter.near_means(facing, np.hstack([lumen.vertices_mm, reach_mm * lumen.vertex_normals]), reach_mm),
         scatter.fits(inside_mm, lumen.vertices_mm),
         {name: len(faces) for name, faces in at_rest.items()},
         len(inside_mm),
     )
 
 
-def _wall_to_lumen(case: FlowCase, faces_mm: Floats, reach_mm: float) -> csr_matrix:
-    """Return the matrix of means over the faces near each vertex, excluding a wall back to back with its own."""
-    lumen = case.vessel.lumen
-    facing = lumen.normals[lumen.closest(faces_mm)[2]]
-    sources = np.hstack([faces_mm, reach_mm * facing])
-    return scatter.near_means(sources, np.hstack([lumen.vertices_mm, reach_mm * lumen.vertex_normals]), reach_mm)
-
-
 def read(case: FlowCase, across: Bridge, folder: Path, time: str) -> Snapshot:
-    """Read the flow at one time of a case.
-
-    Parameters
-    ----------
-    case : FlowCase
-        The flow.
-    across : Bridge
-        The interpolation matrices.
-    folder : Path
-        The case folder.
-    time : str
-        Name of the time.
-
-    Raises
-    ------
-    ReadError
-        A field is missing or damaged.
-    """
+    """Read the flow at one time of a case."""
     density = case.blood.density_kg_m3
     velocity = results.read_field(folder, time, "U")
+    # With a waveform, OpenFOAM's files hold the velocity at inlets divided by the waveform's factor.
+    factor = float(case.inflow_factor(np.array([float(time)]))[0])
+    at_inlets = {name: factor * values for name, values in velocity.references.items()} | velocity.patches
     at_rest = np.zeros((sum(across.walls.values()), 3))
-    known = np.concatenate([velocity.inside, at_rest, *_at_inlets(case, velocity, float(time))])
+    known = np.concatenate([velocity.inside, at_rest, *(at_inlets[inlet.role] for inlet in case.vessel.inlets)])
     pressure_Pa = density * results.read_field(folder, time, "p").inside[:, 0]
     stress = results.read_field(folder, time, "wallShearStress").patches
     # OpenFOAM writes the traction of the wall on the blood, divided by the density.
@@ -141,13 +116,3 @@ def read(case: FlowCase, across: Bridge, folder: Path, time: str) -> Snapshot:
         np.array([folders.flow_mL_s(folder, opening.role, time) for opening in case.vessel.openings]),
         sampling.inflow_mL_s(through_mL_s),
     )
-
-
-def _at_inlets(case: FlowCase, velocity: results.VolumeField, time: float) -> list[Floats]:
-    """Return the velocity (f, 3) on every inlet's faces.
-
-    With a waveform, OpenFOAM's files hold the velocity divided by the waveform's factor.
-    """
-    factor = float(case.inflow_factor(np.array([time]))[0])
-    multiples = {name: factor * values for name, values in velocity.references.items()}
-    return [(multiples | velocity.patches)[inlet.role] for inlet in case.vessel.inlets]

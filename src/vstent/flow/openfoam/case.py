@@ -8,11 +8,11 @@ import numpy as np
 from vstent.deployment.struts import struts
 from vstent.errors import FlowError, LandingError
 from vstent.flow.case import FlowCase
-from vstent.flow.openfoam import boundary, control, mesh, scripts
-from vstent.flow.openfoam.patches import Patch, named_patches, stl_text
+from vstent.flow.openfoam import control, mesh
+from vstent.flow.openfoam.boundary import boundary_files
+from vstent.flow.openfoam.patches import named_patches, stl_text
 from vstent.flow.openfoam.setup import FoamSetup
 from vstent.geometry.surface import Surface
-from vstent.kernels.arrays import Floats
 from vstent.units import M_PER_MM
 
 README: Final = """\
@@ -28,6 +28,25 @@ blood, divided by density: multiply it by minus the density to obtain the wall s
 Mean inflow: {inflow:.6g} mL/s.
 """
 """README file of a case."""
+SLURM: Final = """\
+#!/bin/sh
+#SBATCH --job-name=vstent
+#SBATCH --ntasks={processes}
+#SBATCH --time=04:00:00
+#SBATCH --mem-per-cpu=2G
+#SBATCH --output=slurm-%j.log
+# Load your site's OpenFOAM here, for example: module load openfoam
+# If the job runs out of time, submit it again: it resumes where it stopped.
+./Allrun
+"""
+"""Slurm script, which runs Allrun."""
+ALL_CLEAN: Final = """\
+#!/bin/sh
+cd "${0%/*}" || exit 1
+rm -rf constant/polyMesh constant/extendedFeatureEdgeMesh constant/triSurface/*.eMesh constant/geometry/*.eMesh
+rm -rf processor* postProcessing log.* [1-9]* 0.[0-9]*
+"""
+"""Script that restores the case as exported."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,15 +62,7 @@ class FoamCase:
 
 
 def strut_solids(case: FlowCase) -> Surface | None:
-    """Return the solids of a case's wires, or None without a device.
-
-    Raises
-    ------
-    FlowError
-        The case has media but no wires.
-    LandingError
-        No wire is over a neck or a branch's ostium.
-    """
+    """Return the solids of a case's wires, or None without a device; one without wires over an ostium is refused."""
     if not case.solids and not case.media:
         return None
     if not case.solids:
@@ -73,34 +84,34 @@ def strut_solids(case: FlowCase) -> Surface | None:
 def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
     """Build a case that OpenFOAM meshes and computes: steady, or transient if the case has a waveform.
 
-    Parameters
-    ----------
-    case : the flow. Media are ignored, because OpenFOAM meshes struts instead.
-    setup : mesh, parallel processes, OpenFOAM flavour and struts.
-
-    Raises
-    ------
-    FlowError
-        An opening does not match any open end of the lumen.
+    Media are ignored, because OpenFOAM meshes the struts of the setup instead.
     """
     patches, sections = named_patches(case)
+    vertices_mm, dialect, is_steady = patches[0].surface.vertices_mm, setup.dialect, case.waveform is None
     kinds = {one.name: "wall" if one.name in ("wall", "sac") else "patch" for one in patches}
     walls = [name for name, kind in kinds.items() if kind == "wall"]
+    corners_mm = {one.name: one.corners_mm for one in patches}
+    surfaces = {
+        mesh.LUMEN: corners_mm,
+        mesh.ENDS: {opening.role: corners_mm[opening.role] for opening in case.vessel.openings},
+    }
+    if case.ostium is not None:
+        surfaces[mesh.NECK] = {mesh.NECK: case.ostium.corners_mm}
     if setup.struts is not None:
+        surfaces[mesh.STRUTS] = {mesh.STRUTS: setup.struts.corners_mm}
         walls.append(mesh.STRUTS)
-    application, of_openings = _application(case, setup), boundary.conditions(case, setup, sections)
-    files = _system(case, setup, patches, walls, sections)
-    features, text = mesh.feature_extract(setup)
-    files |= {
-        f"system/{features}": text,
-        "system/snappyHexMeshDict": mesh.snappy(
-            setup, kinds, _ends(case, sections), _inside_mm(case, sections), has_neck=case.ostium is not None
-        ),
-        "0/U": boundary.velocity(of_openings, walls),
-        "0/p": boundary.pressure(of_openings, walls),
-        "Allrun": scripts.all_run(setup, application),
-        "Allclean": scripts.all_clean(),
-        "submit.slurm": scripts.slurm(setup),
+    application = dialect.application(is_steady=is_steady)["application"]
+    files = {
+        "system/controlDict": control.control(case, setup, walls),
+        "system/fvSchemes": control.schemes(is_steady=is_steady),
+        "system/fvSolution": control.solution(),
+        "system/decomposeParDict": control.decomposition(setup.processes, np.ptp(vertices_mm, axis=0)),
+        "system/blockMeshDict": mesh.block_mesh(vertices_mm, setup.cell_size_mm),
+        f"system/{dialect.features}Dict": dialect.rims(f"{mesh.ENDS}.stl"),
+        "system/snappyHexMeshDict": mesh.snappy(case, setup, kinds, sections),
+        "Allrun": _all_run(setup, application),
+        "Allclean": ALL_CLEAN,
+        "submit.slurm": SLURM.format(processes=setup.processes),
         "README": README.format(
             sac=", sac" if "sac" in kinds else "",
             inlets=", ".join(inlet.role for inlet in case.vessel.inlets),
@@ -108,59 +119,33 @@ def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
             inflow=case.inflow_mL_s,
         ),
         "vstent.foam": "",
+        **boundary_files(case, setup, sections, walls),
     }
     files |= {f"constant/{name}": text for name, text in control.fluid(case.blood, setup).items()}
-    folder = "constant/geometry" if setup.flavour == "org" else "constant/triSurface"
-    files |= {f"{folder}/{name}.stl": text for name, text in _surfaces(case, setup, patches).items()}
-    files |= {f"constant/{name}": text for one in of_openings.values() for name, text in one.files.items()}
+    files |= {f"{dialect.surfaces}/{name}.stl": stl_text(solids, M_PER_MM) for name, solids in surfaces.items()}
     return FoamCase(files, ("Allrun", "Allclean", "submit.slurm"), application)
 
 
-def _ends(case: FlowCase, sections: tuple[Floats, ...]) -> dict[str, mesh.End]:
-    """Return where each opening's patch is: its extension, and one diameter of the vessel before it."""
-    ends = {}
-    for one, section in zip(case.vessel.openings, sections, strict=True):
-        end_mm = section.mean(axis=0)
-        along = (end_mm - one.center_mm) / np.linalg.norm(end_mm - one.center_mm)
-        ends[one.role] = mesh.End(one.center_mm - one.diameter_mm * along, end_mm, one.diameter_mm)
-    return ends
-
-
-def _application(case: FlowCase, setup: FoamSetup) -> str:
-    """Return the name of the solver program."""
-    if setup.flavour == "org":
-        return "foamRun"
-    return "simpleFoam" if case.waveform is None else "pimpleFoam"
-
-
-def _system(
-    case: FlowCase, setup: FoamSetup, patches: tuple[Patch, ...], walls: list[str], sections: tuple[Floats, ...]
-) -> dict[str, str]:
-    """Return the files in the folder system/."""
-    is_steady = case.waveform is None
-    step_s = 0.2 * setup.cell_size_mm * M_PER_MM / (2 * float(case.inlet_speeds_m_s.max()))
-    return {
-        "system/controlDict": control.control(case, setup, step_s, walls=walls, has_neck=case.ostium is not None),
-        "system/fvSchemes": control.schemes(is_steady=is_steady),
-        "system/fvSolution": control.solution(),
-        "system/decomposeParDict": control.decomposition(setup, np.ptp(patches[0].surface.vertices_mm, axis=0)),
-        "system/blockMeshDict": mesh.block_mesh(patches[0].surface.vertices_mm, setup.cell_size_mm),
-    }
-
-
-def _surfaces(case: FlowCase, setup: FoamSetup, patches: tuple[Patch, ...]) -> dict[str, str]:
-    """Return the STL files of the case's surfaces."""
-    openings = [opening.role for opening in case.vessel.openings]
-    corners = {one.name: one.corners_mm for one in patches}
-    surfaces = {mesh.LUMEN: corners, mesh.ENDS: {name: corners[name] for name in openings}}
-    if case.ostium is not None:
-        surfaces[mesh.NECK] = {mesh.NECK: case.ostium.corners_mm}
-    if setup.struts is not None:
-        surfaces[mesh.STRUTS] = {mesh.STRUTS: setup.struts.corners_mm}
-    return {name: stl_text(solids, M_PER_MM) for name, solids in surfaces.items()}
-
-
-def _inside_mm(case: FlowCase, sections: tuple[Floats, ...]) -> Floats:
-    """Return a point in the inlet's straight extension that is not on a plane of the background grid."""
-    inlet = case.vessel.inlet
-    return np.asarray(sections[0].mean(axis=0) - inlet.normal * 0.1137 * inlet.diameter_mm)
+def _all_run(setup: FoamSetup, application: str) -> str:
+    """Return Allrun, which meshes once and then computes; run again, it resumes from the last time written."""
+    features, solve = setup.dialect.features, application
+    before = after = ""
+    if setup.processes > 1:
+        solve = f"mpirun -np {setup.processes} {application} -parallel"
+        before = "[ -d processor0 ] || decomposePar > log.decomposePar 2>&1\n"
+        after = "reconstructPar -latestTime > log.reconstructPar 2>&1\n"
+    return f"""\
+#!/bin/sh
+set -e
+cd "${{0%/*}}"
+# Debian's package has no bashrc to source; its programs only need the folder of their settings.
+if [ -z "$WM_PROJECT_DIR" ] && [ -d /usr/share/openfoam/etc ]; then export WM_PROJECT_DIR=/usr/share/openfoam; fi
+if [ ! -f constant/polyMesh/owner ] || [ ! -f log.snappyHexMesh ]; then
+    {features} > log.{features} 2>&1
+    blockMesh > log.blockMesh 2>&1
+    snappyHexMesh -overwrite > log.snappyHexMesh 2>&1
+    checkMesh > log.checkMesh 2>&1
+    renumberMesh -overwrite > log.renumberMesh 2>&1
+fi
+{before}{solve} >> log.{application} 2>&1
+{after}"""

@@ -36,20 +36,19 @@ SECONDS_PER_STRUT_CELL: Final = 1.7e-3
 def tell_cost(case: FlowCase, cell_size_mm: float) -> str:
     """Return a sentence on cells, memory and run time of a steady flow, including struts if the case has solids.
 
-    Raises
-    ------
-    FlowError
-        The case does not fit in the free memory; the message names a grid spacing that does.
-    LandingError
-        No wire is over a neck or a branch's ostium.
+    A case that does not fit in the free memory is refused with a grid spacing that does.
     """
-    bare, at_struts = _cells(case, cell_size_mm)
-    needed, free = _bytes(bare + at_struts), free_memory_bytes()
+    (bare, at_struts), free = _cells(case, cell_size_mm), free_memory_bytes()
+    needed = BYTES_AT_LEAST + BYTES_PER_CELL * (bare + at_struts)
     if needed > free:
+        advice = f"choose the engine {LATTICE}, which does not have to resolve the device's wires"
+        for size_mm in cell_size_mm * WIDER ** np.arange(1, TRIED):
+            if memory_bytes(case, size_mm) < free:
+                advice = f"set a grid spacing of {size_mm:.2g} mm"
+                break
         raise FlowError(
             f"OpenFOAM's mesh of {(bare + at_struts) / 1e6:.3g} million cells at a grid spacing of {cell_size_mm:.3g} "
-            f"mm needs {needed / 1e9:.2g} GB of memory, but only {free / 1e9:.2g} GB are free: "
-            f"{_what_fits(case, cell_size_mm, free)}"
+            f"mm needs {needed / 1e9:.2g} GB of memory, but only {free / 1e9:.2g} GB are free: {advice}"
         )
     seconds = bare * SECONDS_PER_CELL + at_struts * SECONDS_PER_STRUT_CELL
     of_struts = f", {at_struts / 1e3:,.0f} thousand more at the struts" if at_struts else ""
@@ -60,14 +59,8 @@ def tell_cost(case: FlowCase, cell_size_mm: float) -> str:
 
 
 def memory_bytes(case: FlowCase, cell_size_mm: float) -> float:
-    """Return the estimated peak memory of a flow, including struts if the case has solids.
-
-    Raises
-    ------
-    LandingError
-        No wire is over a neck or a branch's ostium.
-    """
-    return _bytes(sum(_cells(case, cell_size_mm)))
+    """Return the estimated peak memory of a flow, including struts if the case has solids."""
+    return BYTES_AT_LEAST + BYTES_PER_CELL * sum(_cells(case, cell_size_mm))
 
 
 def _cells(case: FlowCase, cell_size_mm: float) -> tuple[float, float]:
@@ -80,16 +73,3 @@ def _cells(case: FlowCase, cell_size_mm: float) -> tuple[float, float]:
     base, more = CELLS_ALONG_WIRE
     length_mm = sum(one.wire_length_mm for one in case.solids)
     return bare, length_mm / small_mm * (base + more * setup.strut_thickness_mm / small_mm)
-
-
-def _what_fits(case: FlowCase, cell_size_mm: float, free_bytes: float) -> str:
-    """Return advice for a mesh that fits: a coarser grid spacing, or another engine if the struts need too much."""
-    for size_mm in cell_size_mm * WIDER ** np.arange(1, TRIED):
-        if _bytes(sum(_cells(case, size_mm))) < free_bytes:
-            return f"set a grid spacing of {size_mm:.2g} mm"
-    return f"choose the engine {LATTICE}, which does not have to resolve the device's wires"
-
-
-def _bytes(cells: float) -> float:
-    """Return the peak memory for a number of cells."""
-    return BYTES_AT_LEAST + BYTES_PER_CELL * cells

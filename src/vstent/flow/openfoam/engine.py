@@ -15,14 +15,14 @@ import numpy as np
 from vstent.errors import FlowError
 from vstent.flow import domain as domains
 from vstent.flow.case import PHASES, FlowCase, FlowField, Level, Phase
-from vstent.flow.cycles import cycle_change, cycles_advice, pulse_of
+from vstent.flow.cycles import cycle_change, cycles_advice
 from vstent.flow.engines import AbstractEngine, Outcome, Saved
 from vstent.flow.openfoam import folder as folders
 from vstent.flow.openfoam import program, results
 from vstent.flow.openfoam.bridge import Bridge, Snapshot, bridge, read
 from vstent.flow.openfoam.case import foam_case, strut_solids
 from vstent.flow.openfoam.cost import memory_bytes, tell_cost
-from vstent.flow.openfoam.setup import FoamSetup
+from vstent.flow.openfoam.setup import ITERATIONS, FoamSetup
 from vstent.flow.stopping import quantities_left
 from vstent.kernels.arrays import Floats, Ints
 
@@ -64,9 +64,26 @@ class State:
     """Run time of the solver."""
 
     @property
-    def is_pulse(self) -> bool:
-        """Whether the inflow follows a waveform."""
-        return self.case.waveform is not None
+    def phase_s(self) -> float | None:
+        """Time between two phases of a cycle; None: steady inflow."""
+        return None if self.case.waveform is None else self.case.waveform.period_s / PHASES
+
+    @property
+    def phases_done(self) -> int:
+        """Number of phases since the start of the waveform, including earlier runs that this one resumed."""
+        return round(float(self.snapshots[-1].time) / self.phase_s) if self.phase_s and self.snapshots else 0
+
+    def add_check(self, time: str) -> None:
+        """Read the output at one time, and add the monitored quantities to the history.
+
+        They are those of the embedded engine: mean speed in sac and vessel, inlet pressure, neck inflow.
+        """
+        now = read(self.case, self.bridge, self.folder, time)
+        speed = np.linalg.norm(now.velocity_m_s, axis=1)
+        inlet = self.domain.link_cell[self.domain.link_patch == 1]
+        values = [speed[self.sac_cells].mean(), now.pressure_Pa[inlet].mean(), speed.mean()]
+        self.snapshots.append(now)
+        self.history.append(np.array(values if self.case.ostium is None else [*values, now.neck_inflow_mL_s]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,9 +112,7 @@ class OpenFoam(AbstractEngine[State]):
         if self.folder is None:
             raise FlowError("the engine openfoam needs a folder for its files: name one")
         solids, found = strut_solids(case), program.find()
-        setup = FoamSetup(
-            self.cell_size_mm, found.flavour, self.layers, processes=case.numerics.processes, struts=solids
-        )
+        setup = FoamSetup(self.cell_size_mm, found.flavour, self.layers, case.numerics.processes, solids)
         domain = domains.build(case.vessel, self.grid_size_mm or self.cell_size_mm)
         sac = domains.cells_of_sac(case, domain)
         foam = foam_case(case, setup)
@@ -106,21 +121,24 @@ class OpenFoam(AbstractEngine[State]):
         if start is not None and not results.times(self.folder):
             folders.begin_from(self.folder, start)
         across = bridge(case, domain, self.folder)
-        kept: deque[Snapshot] = deque(maxlen=PHASES if case.waveform else CHECKS_AVERAGED)
-        state = State(case, setup, found, foam.application, self.folder, domain, across, sac, kept)
-        for time in _whole_cycles(case, results.times(self.folder)):
-            _note(state, time)
+        snapshots: deque[Snapshot] = deque(maxlen=PHASES if case.waveform else CHECKS_AVERAGED)
+        state = State(case, setup, found, foam.application, self.folder, domain, across, sac, snapshots)
+        if state.phase_s:  # resumed at the first complete cycle
+            written = results.times(self.folder)
+            is_first = [round(float(time) / state.phase_s) % PHASES == 1 for time in written]
+            for time in written[is_first.index(True) :] if any(is_first) else []:
+                state.add_check(time)
         return state
 
     def step(self, state: State) -> State:
         """Run the solver to the next check and read its output."""
-        began = perf_counter()
-        reached = results.times(state.folder)
-        end = _next_end(state, float(reached[-1]) if reached else 0.0)
-        folders.stop_at(state.folder, end, every=None if state.is_pulse else CHECK_ITERATIONS)
+        began, phase_s = perf_counter(), state.phase_s
+        reached = float((results.times(state.folder) or ["0"])[-1])
+        end = reached + CHECK_ITERATIONS if phase_s is None else (round(reached / phase_s) + 1) * phase_s
+        folders.stop_at(state.folder, end, every=CHECK_ITERATIONS if phase_s is None else None)
         said = program.run(state.found, state.folder, [state.application], processes=state.setup.processes)
         state.loop_seconds += perf_counter() - began
-        _note(state, results.times(state.folder)[-1])
+        state.add_check(results.times(state.folder)[-1])
         state.is_settled = not _correct_inflow(state) and "solution converged" in said
         return state
 
@@ -129,11 +147,9 @@ class OpenFoam(AbstractEngine[State]):
         history = np.array(state.history)
         if not np.isfinite(history[-1]).all():
             return float("nan")
-        if state.is_pulse:
+        if state.phase_s:
             return cycle_change(history)
-        if state.is_settled:
-            return 0.0
-        return quantities_left(history)
+        return 0.0 if state.is_settled else quantities_left(history)
 
     def save(self, state: State) -> None:
         """Return None: a run resumes from OpenFOAM's own output in the case folder."""
@@ -152,53 +168,52 @@ class OpenFoam(AbstractEngine[State]):
 
     def max_checks(self, state: State) -> int:
         """Return the number of checks within the limit of iterations, or of remaining phases of all cycles."""
-        if state.is_pulse:
-            left = PHASES * state.case.numerics.max_cycles - _phases_done(state)
-            return left if left > 0 else PHASES
-        return state.setup.iterations // CHECK_ITERATIONS
+        if state.phase_s is None:
+            return ITERATIONS // CHECK_ITERATIONS
+        left = PHASES * state.case.numerics.max_cycles - state.phases_done
+        return left if left > 0 else PHASES
 
     def result(self, state: State, outcome: Outcome) -> FlowField:
         """Return the last check's flow, or a mean: of the last checks if not converged, of the cycle if pulsatile."""
-        is_last = outcome.is_converged and not state.is_pulse
-        return _field_of(state, [state.snapshots[-1]] if is_last else list(state.snapshots), outcome)
+        snapshots, phase_s = list(state.snapshots), state.phase_s
+        if outcome.is_converged and phase_s is None:
+            snapshots = snapshots[-1:]
 
+        def mean(name: str) -> Floats:
+            return np.asarray(np.mean([getattr(one, name) for one in snapshots], axis=0))
 
-def _next_end(state: State, reached: float) -> float:
-    """Return the iteration or time of the next check."""
-    if not state.is_pulse:
-        return reached + CHECK_ITERATIONS
-    phase_s = pulse_of(state.case).period_s / PHASES
-    return (round(reached / phase_s) + 1) * phase_s
-
-
-def _whole_cycles(case: FlowCase, written: list[str]) -> list[str]:
-    """Return the times from the start of the first complete cycle on; none for a steady flow."""
-    if case.waveform is None:
-        return []
-    phase_s = case.waveform.period_s / PHASES
-    is_first = [round(float(time) / phase_s) % PHASES == 1 for time in written]
-    return written[is_first.index(True) :] if any(is_first) else []
-
-
-def _phases_done(state: State) -> int:
-    """Return the number of phases since the start of the waveform, including earlier runs that this one resumed."""
-    if not state.snapshots:
-        return 0
-    return round(float(state.snapshots[-1].time) * PHASES / pulse_of(state.case).period_s)
-
-
-def _note(state: State, time: str) -> None:
-    """Read the output at one time and record the monitored quantities."""
-    state.snapshots.append(read(state.case, state.bridge, state.folder, time))
-    state.history.append(_monitored(state, state.snapshots[-1]))
-
-
-def _monitored(state: State, now: Snapshot) -> Floats:
-    """Return the quantities of the embedded engine: mean speed in sac and vessel, inlet pressure, neck inflow."""
-    speed = np.linalg.norm(now.velocity_m_s, axis=1)
-    inlet = state.domain.link_cell[state.domain.link_patch == 1]
-    values = [speed[state.sac_cells].mean(), now.pressure_Pa[inlet].mean(), speed.mean()]
-    return np.array([*values, now.neck_inflow_mL_s] if state.case.ostium is not None else values, dtype=float)
+        vessel, domain = state.case.vessel, state.domain
+        pressure_Pa = mean("pressure_Pa")
+        inlet_Pa, outlet_Pa = vessel.of_inlets_and_outlets(domains.section_pressure_Pa(vessel, domain, pressure_Pa))
+        backwards_mL_s, outlets_mL_s = vessel.of_inlets_and_outlets(mean("outflow_mL_s"))
+        speed_m_s, shear_Pa = (None, None) if phase_s or len(snapshots) == 1 else mean_magnitudes(snapshots)
+        steps = len(state.history) * (1 if phase_s else CHECK_ITERATIONS)
+        phases = []
+        for k, one in enumerate(snapshots if phase_s else ()):
+            back_mL_s, out_mL_s = vessel.of_inlets_and_outlets(one.outflow_mL_s)
+            moment = (one.velocity_m_s,), (one.pressure_Pa,), one.wall_shear_stress_Pa
+            phases.append(Phase((k + 1) * (phase_s or 0.0), -back_mL_s, out_mL_s, *moment, one.neck_inflow_mL_s))
+        return FlowField(
+            levels=(Level.of(domain, mean("velocity_m_s"), pressure_Pa, speed_m_s),),
+            wall=vessel.lumen,
+            wall_shear_stress_Pa=mean("wall_shear_stress_Pa"),
+            wall_pressure_Pa=mean("wall_pressure_Pa"),
+            inlets_mL_s=-backwards_mL_s,
+            outlets_mL_s=outlets_mL_s,
+            inlet_pressure_Pa=inlet_Pa,
+            outlet_pressure_Pa=outlet_Pa,
+            blood=state.case.blood,
+            is_converged=outcome.is_converged,
+            unsettled_fraction=outcome.residual[-1],
+            advice=_advice(state, outcome),
+            residual=np.array(outcome.residual),
+            steps=steps,
+            seconds=outcome.seconds,
+            updates_per_s=state.bridge.n_cells * steps / max(state.loop_seconds, 1e-9),
+            phases=tuple(phases),
+            mean_shear_Pa=shear_Pa,
+            neck_inflow_mL_s=float(mean("neck_inflow_mL_s")),
+        )
 
 
 def _correct_inflow(state: State) -> bool:
@@ -216,70 +231,22 @@ def _correct_inflow(state: State) -> bool:
     return any(scaled)
 
 
-def _field_of(state: State, kept: list[Snapshot], outcome: Outcome) -> FlowField:
-    """Return the mean of the snapshots as a flow field."""
-
-    def mean(name: str) -> Floats:
-        return np.asarray(np.mean([getattr(one, name) for one in kept], axis=0))
-
-    vessel, domain = state.case.vessel, state.domain
-    pressure_Pa, outflow_mL_s = mean("pressure_Pa"), mean("outflow_mL_s")
-    inlet_Pa, outlet_Pa = vessel.of_inlets_and_outlets(domains.section_pressure_Pa(vessel, domain, pressure_Pa))
-    backwards_mL_s, outlets_mL_s = vessel.of_inlets_and_outlets(outflow_mL_s)
-    speed_m_s, shear_Pa = (None, None) if state.is_pulse or len(kept) == 1 else mean_magnitudes(kept)
-    steps = len(state.history) * (1 if state.is_pulse else CHECK_ITERATIONS)
-    return FlowField(
-        levels=(Level.of(domain, mean("velocity_m_s"), pressure_Pa, speed_m_s),),
-        wall=vessel.lumen,
-        wall_shear_stress_Pa=mean("wall_shear_stress_Pa"),
-        wall_pressure_Pa=mean("wall_pressure_Pa"),
-        inlets_mL_s=-backwards_mL_s,
-        outlets_mL_s=outlets_mL_s,
-        inlet_pressure_Pa=inlet_Pa,
-        outlet_pressure_Pa=outlet_Pa,
-        blood=state.case.blood,
-        is_converged=outcome.is_converged,
-        unsettled_fraction=outcome.residual[-1],
-        advice=_advice(state, outcome),
-        residual=np.array(outcome.residual),
-        steps=steps,
-        seconds=outcome.seconds,
-        updates_per_s=state.bridge.n_cells * steps / max(state.loop_seconds, 1e-9),
-        phases=_phases(state.case, kept) if state.is_pulse else (),
-        mean_shear_Pa=shear_Pa,
-        neck_inflow_mL_s=float(mean("neck_inflow_mL_s")),
-    )
-
-
-def mean_magnitudes(kept: list[Snapshot]) -> tuple[Floats, Floats]:
+def mean_magnitudes(snapshots: list[Snapshot]) -> tuple[Floats, Floats]:
     """Return mean speed (n,) and mean wall shear stress (v,) of the checks of a steady solver that did not converge."""
-    speed_m_s = np.mean([np.linalg.norm(one.velocity_m_s, axis=1) for one in kept], axis=0)
-    shear_Pa = np.mean([np.linalg.norm(one.wall_shear_stress_Pa, axis=1) for one in kept], axis=0)
+    speed_m_s = np.mean([np.linalg.norm(one.velocity_m_s, axis=1) for one in snapshots], axis=0)
+    shear_Pa = np.mean([np.linalg.norm(one.wall_shear_stress_Pa, axis=1) for one in snapshots], axis=0)
     return np.asarray(speed_m_s), np.asarray(shear_Pa)
-
-
-def _phases(case: FlowCase, cycle: list[Snapshot]) -> tuple[Phase, ...]:
-    """Return the last cycle as phases, with times of the waveform."""
-    phase_s = pulse_of(case).period_s / PHASES
-
-    def phase(k: int, one: Snapshot) -> Phase:
-        backwards_mL_s, outlets_mL_s = case.vessel.of_inlets_and_outlets(one.outflow_mL_s)
-        moment = (one.velocity_m_s,), (one.pressure_Pa,), one.wall_shear_stress_Pa
-        return Phase((k + 1) * phase_s, -backwards_mL_s, outlets_mL_s, *moment, one.neck_inflow_mL_s)
-
-    return tuple(phase(k, one) for k, one in enumerate(cycle))
 
 
 def _advice(state: State, outcome: Outcome) -> str:
     """Return a sentence on convergence and what to do, followed by the size of the mesh."""
     mesh = f"OpenFOAM on {state.bridge.n_cells} cells ({state.folder})."
-    if state.is_pulse:
+    if state.phase_s:
         changes = np.array([change for change in outcome.residual if np.isfinite(change)])
-        cycles = _phases_done(state) // PHASES
-        return f"{cycles_advice(changes, cycles, is_converged=outcome.is_converged)} {mesh}"
+        return f"{cycles_advice(changes, state.phases_done // PHASES, is_converged=outcome.is_converged)} {mesh}"
     if outcome.is_converged:
         return f"The flow has converged. {mesh}"
     return (
-        f"The steady solver did not converge within {state.setup.iterations} iterations, perhaps because the flow is "
-        f"unsteady: compute it in time with an inflow waveform. {mesh}"
+        f"The steady solver did not converge within {ITERATIONS} iterations, perhaps because the flow is unsteady: "
+        f"compute it in time with an inflow waveform. {mesh}"
     )

@@ -12,7 +12,8 @@ from vstent.flow import sampling
 from vstent.flow.case import FlowField
 from vstent.flow.openfoam import program, results
 from vstent.flow.openfoam.case import FoamCase
-from vstent.flow.openfoam.setup import FEATURES, FoamSetup
+from vstent.flow.openfoam.dictionary import vector
+from vstent.flow.openfoam.setup import FoamSetup
 from vstent.io.writers import write_text
 from vstent.kernels.arrays import Floats
 from vstent.units import M3_PER_ML, M_PER_MM
@@ -50,30 +51,21 @@ def prepare(folder: Path, foam: FoamCase) -> None:
 
 
 def mesh(found: program.Program, folder: Path, setup: FoamSetup) -> None:
-    """Mesh the case, decompose it and write the cell centres, unless that is already done.
-
-    Parameters
-    ----------
-    setup : setup of the OpenFOAM case.
-
-    Raises
-    ------
-    FlowError
-        A program of OpenFOAM fails.
-    """
+    """Mesh the case, decompose it and write the cell centres, unless that is already done."""
     if (folder / MESHED).exists():
         return
-    for words in (
-        [FEATURES[found.flavour]],
+    commands = [
+        [setup.dialect.features],
         ["blockMesh"],
         ["snappyHexMesh", "-overwrite"],
         ["renumberMesh", "-overwrite"],
-    ):
-        program.run(found, folder, words)
+    ]
     if setup.processes > 1:
-        program.run(found, folder, ["decomposePar", "-force"])
-    after = "foamPostProcess" if found.flavour == "org" else "postProcess"
-    program.run(found, folder, [after, "-func", "writeCellCentres", "-time", "0"], processes=setup.processes)
+        commands.append(["decomposePar", "-force"])
+    for words in commands:
+        program.run(found, folder, words)
+    centres = [setup.dialect.post_process, "-func", "writeCellCentres", "-time", "0"]
+    program.run(found, folder, centres, processes=setup.processes)
     write_text(folder / MESHED, "")
 
 
@@ -123,5 +115,5 @@ def scale_inflow(folder: Path, inlet: str, factor: float) -> bool:
         return False
     lines = path.read_text().splitlines()
     mean = [factor * float(x) for x in lines[-1].strip("()").split()]
-    write_text(path, "\n".join([*lines[:-1], "(" + " ".join(f"{x:.9g}" for x in mean) + ")", ""]))
+    write_text(path, "\n".join([*lines[:-1], vector(mean), ""]))
     return True

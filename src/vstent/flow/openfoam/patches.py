@@ -41,17 +41,8 @@ class Patch:
 def named_patches(case: FlowCase) -> tuple[tuple[Patch, ...], tuple[Floats, ...]]:
     """Divide the boundary of the blood into patches: ``wall``, ``sac`` if there is one, ``inlet``, ``outlet_1``, ...
 
-    Every opening is at the end of the straight extension that all engines use (see `domain.extend`).
-
-    Returns
-    -------
-    patches : patches of one closed surface; every face is in exactly one.
-    sections : tuple of (k, 3); for every opening the polygon of its end, in mm.
-
-    Raises
-    ------
-    FlowError
-        An opening does not match any open end of the lumen.
+    Every opening is at the end of the straight extension that all engines use (see `domain.extend`). The second value
+    is the polygon (k, 3) in mm of every such end.
     """
     surface, face_patch, sections = extend(case.vessel)
     wall = np.flatnonzero(face_patch == 0)
@@ -64,23 +55,16 @@ def named_patches(case: FlowCase) -> tuple[tuple[Patch, ...], tuple[Floats, ...]
 
 
 def stl_text(solids: dict[str, Floats], scale: float) -> str:
-    """Return named solids as the text of one ASCII STL file.
-
-    Parameters
-    ----------
-    solids : dict of (f, 3, 3); corners of each solid's faces, by name.
-    scale : factor on all lengths.
-    """
-    return "".join(_solid(name, corners * scale) for name, corners in solids.items())
-
-
-def _solid(name: str, corners: Floats) -> str:
-    """Return the STL text of one solid."""
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    rows = np.concatenate([normal, corners.reshape(-1, 9)], axis=1)
+    """Return named solids, corners (f, 3, 3) times a scale, as the text of one ASCII STL file."""
     face = (
         "facet normal %.6g %.6g %.6g\nouter loop\nvertex %.9g %.9g %.9g\nvertex %.9g %.9g %.9g\n"
         "vertex %.9g %.9g %.9g\nendloop\nendfacet\n"
     )
-    return f"solid {name}\n" + "".join(face % tuple(row) for row in rows) + f"endsolid {name}\n"
+    text = ""
+    for name, corners in solids.items():
+        scaled = corners * scale
+        normal = np.cross(scaled[:, 1] - scaled[:, 0], scaled[:, 2] - scaled[:, 0])
+        normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+        rows = np.concatenate([normal, scaled.reshape(-1, 9)], axis=1)
+        text += f"solid {name}\n" + "".join(face % tuple(row) for row in rows) + f"endsolid {name}\n"
+    return text

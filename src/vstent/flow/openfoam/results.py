@@ -35,31 +35,23 @@ class VolumeField:
 
 
 def read_field(folder: Path, time: str, name: str) -> VolumeField:
-    """Read an ASCII field of a case, joined over the folders of its processes if it is decomposed.
-
-    Raises
-    ------
-    ReadError
-        The field is missing or damaged.
-    """
+    """Read an ASCII field of a case, joined over the folders of its processes if it is decomposed."""
     parts = sorted(folder.glob("processor[0-9]*"), key=lambda part: int(part.name[9:])) or [folder]
     fields = [_parsed(part / time / name) for part in parts]
     return VolumeField(
         np.concatenate([field.inside for field in fields]),
-        _by_patch([field.patches for field in fields]),
-        _by_patch([field.references for field in fields]),
+        _joined([field.patches for field in fields]),
+        _joined([field.references for field in fields]),
     )
 
 
-def _by_patch(parts: list[dict[str, Floats]]) -> dict[str, Floats]:
-    """Return the values of all processes by patch."""
-    names = {name for part in parts for name in part}
-    return {name: _joined([part[name] for part in parts if name in part]) for name in names}
-
-
-def _joined(parts: list[Floats]) -> Floats:
-    """Return the values of all processes joined; empty parts are skipped because their width is unknown."""
-    return np.concatenate([part for part in parts if len(part)] or parts[:1])
+def _joined(parts: list[dict[str, Floats]]) -> dict[str, Floats]:
+    """Return the values of all processes by patch; empty parts are skipped because their width is unknown."""
+    joined = {}
+    for name in {name for part in parts for name in part}:
+        values = [part[name] for part in parts if name in part]
+        joined[name] = np.concatenate([part for part in values if len(part)] or values[:1])
+    return joined
 
 
 def _parsed(path: Path) -> VolumeField:
@@ -67,18 +59,19 @@ def _parsed(path: Path) -> VolumeField:
     try:
         text = path.read_text()
         inside, _, boundary = text.partition("boundaryField")
-        values = _values(inside[inside.index("internalField") :])
-        return VolumeField(values, _entries(boundary, _ENTRY), _entries(boundary, _REFERENCE))
+        fields = [
+            {
+                name: _values(body[match.end() :])
+                for name, body in _PATCH.findall(boundary)
+                if (match := entry.search(body))
+            }
+            for entry in (_ENTRY, _REFERENCE)
+        ]
+        return VolumeField(_values(inside[inside.index("internalField") :]), *fields)
     except (OSError, ValueError) as error:
         raise ReadError(
             f"OpenFOAM's field {path} is missing or damaged ({error}): delete its case folder and compute again"
         ) from error
-
-
-def _entries(boundary: str, entry: re.Pattern[str]) -> dict[str, Floats]:
-    """Return the values that follow an entry, for the patches that have it."""
-    bodies = _PATCH.findall(boundary)
-    return {name: _values(body[found.end() :]) for name, body in bodies if (found := entry.search(body))}
 
 
 def _values(text: str) -> Floats:
@@ -88,14 +81,14 @@ def _values(text: str) -> Floats:
         if uniform is None:
             raise ValueError("an entry without a value")
         return _numbers(uniform[1])[None]
-    kind, count = listed[1], int(listed[2])
-    end = re.compile(r"\)\s*;" if listed[3] == "(" else r"\}\s*;").search(text, listed.end() - 1)
+    count, bracket = int(listed[2]), listed[3]
+    end = re.compile(r"\)\s*;" if bracket == "(" else r"\}\s*;").search(text, listed.end() - 1)
     if end is None:
         raise ValueError("a list without an end")
     numbers = _numbers(text[listed.end() : end.start()])
-    width = {"scalar": 1, "vector": 3, None: 1}[kind]
-    if listed[3] == "{":
+    if bracket == "{":
         return np.tile(numbers, (count, 1))
+    width = 3 if listed[1] == "vector" else 1
     if len(numbers) != count * width:
         raise ValueError(f"a list of {count} entries with {len(numbers)} numbers")
     return numbers.reshape(count, width)
@@ -107,10 +100,7 @@ def _numbers(text: str) -> Floats:
 
 
 def times(folder: Path) -> list[str]:
-    """Return the names of the times written, in order and without 0.
-
-    If the case is decomposed, they are those of the first process.
-    """
+    """Return the names of the times written, in order and without 0; of a decomposed case those of its first part."""
     place = folder / "processor0" if (folder / "processor0").is_dir() else folder
-    names = [entry.name for entry in place.iterdir() if entry.is_dir() and re.fullmatch(r"[0-9.e+-]+", entry.name)]
-    return sorted((name for name in names if float(name) > 0 and (place / name / "U").exists()), key=float)
+    names = [entry.parent.name for entry in place.glob("*/U") if re.fullmatch(r"[0-9.e+-]+", entry.parent.name)]
+    return sorted((name for name in names if float(name) > 0), key=float)

@@ -17,15 +17,10 @@ BLOCK: Final = 20_000
 
 
 def fits(sources: Floats, targets: Floats) -> csr_matrix:
-    """Return the matrix (t, s) that interpolates from scattered sources to targets, exact for quadratics.
+    """Return the matrix (t, s) that interpolates from scattered sources (s, 3) to targets (t, 3), exact for quadratics.
 
     Moving least squares over the nearest sources (Lancaster and Salkauskas 1981, Math. Comput. 37, 141). Where the
     sources are in one plane, the derivatives that they do not determine are taken as zero.
-
-    Parameters
-    ----------
-    sources : (s, 3); points with known values.
-    targets : (t, 3); points at which values are wanted.
     """
     count = min(NEIGHBOURS, len(sources))
     tree = cKDTree(sources)
@@ -33,32 +28,25 @@ def fits(sources: Floats, targets: Floats) -> csr_matrix:
     for start in range(0, max(len(targets), 1), BLOCK):
         block = targets[start : start + BLOCK]
         distance, near = tree.query(block, k=count)
-        weights.append(_fit(sources[near] - block[:, None], np.asarray(distance)))
+        distance = np.asarray(distance)
+        reach = 1.05 * distance[:, -1:]
+        weight = (1 - (distance / reach) ** 2) ** 2
+        x, y, z = np.moveaxis((sources[near] - block[:, None]) / reach[..., None], 2, 0)
+        basis = np.stack([np.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, y * z, z * x], axis=2)
+        weighted = basis * weight[..., None]
+        matrix = np.einsum("tki,tkj->tij", weighted, basis)
+        matrix[:, 1:, 1:] += RIDGE * weight.sum(axis=1)[:, None, None] * np.eye(9)
+        value = np.zeros((len(matrix), 10, 1))
+        value[:, 0] = 1
+        weights.append(np.einsum("tki,ti->tk", weighted, np.linalg.solve(matrix, value)[..., 0]))
         columns.append(near)
-    weight, column = np.concatenate(weights), np.concatenate(columns)
     starts = np.arange(len(targets) + 1) * count
-    return csr_matrix((weight.ravel(), column.ravel(), starts), shape=(len(targets), len(sources)))
-
-
-def _fit(offset: Floats, distance: Floats) -> Floats:
-    """Return the weights (t, k) of the neighbours at offsets (t, k, 3)."""
-    reach = 1.05 * distance[:, -1:]
-    weight = (1 - (distance / reach) ** 2) ** 2
-    x, y, z = np.moveaxis(offset / reach[..., None], 2, 0)
-    basis = np.stack([np.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, y * z, z * x], axis=2)
-    weighted = basis * weight[..., None]
-    matrix = np.einsum("tki,tkj->tij", weighted, basis)
-    matrix[:, 1:, 1:] += RIDGE * weight.sum(axis=1)[:, None, None] * np.eye(9)
-    value = np.zeros((len(matrix), 10, 1))
-    value[:, 0] = 1
-    return np.asarray(np.einsum("tki,ti->tk", weighted, np.linalg.solve(matrix, value)[..., 0]))
+    columns_of = np.concatenate(columns).ravel()
+    return csr_matrix((np.concatenate(weights).ravel(), columns_of, starts), shape=(len(targets), len(sources)))
 
 
 def near_means(sources: Floats, targets: Floats, reach: float) -> csr_matrix:
-    """Return the matrix (t, s) of inverse-distance weighted means over the four nearest sources.
-
-    Shapes: `sources` (s, d), `targets` (t, d).
-    """
+    """Return the matrix (t, s) of inverse-distance weighted means over the four nearest of sources (s, d)."""
     count = min(4, len(sources))
     distance, near = cKDTree(sources).query(targets, k=count)
     weight = 1 / (np.asarray(distance).reshape(-1, count) ** 2 + (0.1 * reach) ** 2)

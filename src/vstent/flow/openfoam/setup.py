@@ -2,22 +2,17 @@
 
 import math
 from dataclasses import dataclass
-from typing import Final, Literal, TypeAlias
 
+from vstent.flow.openfoam.dialects import DIALECTS, Dialect, Flavour
 from vstent.geometry.surface import Surface
-
-Flavour: TypeAlias = Literal["com", "org"]
-"""openfoam.com (Debian's 1912 and later) or openfoam.org (11 and later); some dictionary entries have different
-names."""
-
-FEATURES: Final[dict[Flavour, str]] = {"com": "surfaceFeatureExtract", "org": "surfaceFeatures"}
-"""Program of each flavour that extracts sharp rims."""
 
 BASE_LEVEL = 2
 """Number of times that snappyHexMesh halves the background cells to reach the grid spacing in the vessel."""
 ACROSS = 2.0
 """Minimum number of cells across a strut. With one instead of two, a braid let 19 % more blood through the demo's
 neck."""
+ITERATIONS = 1000
+"""Maximum number of iterations of a steady flow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,22 +25,21 @@ class FoamSetup:
     """OpenFOAM flavour that the case is written for."""
     layers: int = 2
     """Number of flat cell layers along the wall."""
-    neck_levels: int = 1
-    """Number of times that cells near the neck are halved."""
-    strut_levels: int | None = None
-    """Number of times that cells at the struts are halved; None: until at least `ACROSS` cells are across a strut."""
     processes: int = 1
     """Number of parts of the decomposed mesh, one for each process."""
-    iterations: int = 1000
-    """Maximum number of iterations of a steady flow."""
     struts: Surface | None = None
     """Closed solids of the device, in mm, all of which are meshed; None: no device."""
 
     @property
+    def dialect(self) -> Dialect:
+        """Names and syntax of the flavour."""
+        return DIALECTS[self.flavour]
+
+    @property
     def levels_at_struts(self) -> int:
-        """Number of times that cells at the struts are halved."""
-        if self.strut_levels is not None or self.struts is None:
-            return self.strut_levels or 0
+        """Number of times that cells at the struts are halved, until at least `ACROSS` are across a strut."""
+        if self.struts is None:
+            return 0
         return max(0, math.ceil(math.log2(ACROSS * self.cell_size_mm / self.strut_thickness_mm)))
 
     @property

@@ -10,7 +10,7 @@ import pytest
 from tubes import line, tube
 
 from vstent.flow import simulation
-from vstent.flow.beside import Beside
+from vstent.flow.background import BackgroundWork
 from vstent.flow.case import FlowCase
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.problem import vessel_case
@@ -35,10 +35,10 @@ def fail() -> None:
 
 @pytest.mark.parametrize("numerics", [None, HERE])
 def test_without_a_gpu_work_is_done_in_place_and_at_once(numerics: Numerics | None) -> None:
-    with Beside(numerics) as beside:
-        assert beside.do(get_ident)() == get_ident()
+    with BackgroundWork(numerics) as background:
+        assert background.begin(get_ident)() == get_ident()
         with pytest.raises(OSError, match="no space"):
-            beside.do(fail)
+            background.begin(fail)
 
 
 @pytest.mark.parametrize("layer", ["workqueue", None])
@@ -51,8 +51,8 @@ def test_parallel_kernels_of_two_threads_need_a_layer_that_allows_them(
         return layer
 
     monkeypatch.setattr(numba, "threading_layer", threading_layer)
-    with Beside(GPU) as beside:
-        assert beside.do(get_ident)() == get_ident()
+    with BackgroundWork(GPU) as background:
+        assert background.begin(get_ident)() == get_ident()
 
 
 def test_with_a_gpu_work_is_done_meanwhile_in_order_and_before_the_end() -> None:
@@ -63,11 +63,11 @@ def test_with_a_gpu_work_is_done_meanwhile_in_order_and_before_the_end() -> None
         done.append("first")
         return get_ident()
 
-    with Beside(GPU) as beside:
-        begun = beside.do(first)
-        failed = beside.do(fail)
-        threads = beside.do(numba.get_num_threads)
-        beside.do(partial(done.append, "last"))
+    with BackgroundWork(GPU) as background:
+        begun = background.begin(first)
+        failed = background.begin(fail)
+        threads = background.begin(numba.get_num_threads)
+        background.begin(partial(done.append, "last"))
         assert not done
         goes_on.set()
         assert begun() != get_ident()
@@ -85,8 +85,8 @@ def test_a_study_that_fails_does_not_lose_what_was_begun() -> None:
         done.append("late")
 
     def study() -> None:
-        with Beside(GPU) as beside:
-            beside.do(late)
+        with BackgroundWork(GPU) as background:
+            background.begin(late)
             goes_on.set()
             raise KeyboardInterrupt
 
