@@ -99,7 +99,7 @@ def asked(monkeypatch):
 
 
 def framed(*question):
-    return cells._closed_frame(*question[:6])
+    return cells._frame(*question)
 
 
 def test_the_joints_lie_where_an_independent_minimiser_puts_them(monkeypatch):

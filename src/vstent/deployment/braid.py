@@ -10,11 +10,11 @@ from vstent.deployment import pieces
 from vstent.deployment.active_contour import State
 from vstent.deployment.contour import evenly_spaced, perimeters, planes
 from vstent.deployment.method import AbstractMethod, Opened, Placement, check_inside
-from vstent.devices.design import Design, LaserCut, Size, widest_mm
+from vstent.devices.design import Design, Size, widest_mm
 from vstent.devices.formulas import free_diameters_mm, grid, row_spacing_mm
 from vstent.devices.stent import Landing, row_diameters_mm
 from vstent.geometry.vessel import Anatomy
-from vstent.kernels.arrays import Bools, Floats, Ints
+from vstent.kernels.arrays import Bools, Floats
 from vstent.units import MM_PER_UM
 
 ROUNDS = 8
@@ -56,14 +56,9 @@ class Profile:
         return row_spacing_mm(design, size, self.at(abscissa_mm), np.interp(abscissa_mm, *self.bend))
 
     def corrected(self, abscissa_mm: Floats, diameter_mm: Floats) -> "Profile":
-        """Return a profile that passes through measured diameters.
+        """Return a profile that passes through measured diameters (r,) at increasing arc lengths (r,).
 
-        Parameters
-        ----------
-        abscissa_mm : (r,), mm; increasing arc lengths of the measurements.
-        diameter_mm : (r,), mm; measured diameters.
-
-        Returns profile through the measurements. Beyond them it keeps its shape, shifted to meet the outermost ones.
+        Beyond them it keeps its shape, shifted to meet the outermost ones.
         """
         error_mm = np.interp(self.abscissa_mm, abscissa_mm, diameter_mm - self.at(abscissa_mm))
         outside = (self.abscissa_mm < abscissa_mm[0]) | (self.abscissa_mm > abscissa_mm[-1])
@@ -82,26 +77,19 @@ def expected_profile(design: Design, size: Size, anatomy: Anatomy) -> Profile:
     For a laser-cut device the curvature is left out, so its rows start as in a straight artery. In a tight bend its
     cells leave the wall, and its rows do not come as close together as those of a braid. `vstent.deployment.cells` then
     moves them.
-
-    Returns expected diameter along the parent axis, with its curvature for a braid.
     """
     offset_mm = design.wall_offset_um * MM_PER_UM
     diameter_mm = np.minimum(2 * (anatomy.parent.section_radius_mm - offset_mm), widest_mm(design, size))
-    if isinstance(design, LaserCut):
+    if not design.follows_bends:
         return Profile(anatomy.parent.axis.abscissa_mm, diameter_mm)
-    return Profile(anatomy.parent.axis.abscissa_mm, diameter_mm, bend(anatomy))
+    across = planes(anatomy.parent.axis)
+    return Profile(anatomy.parent.axis.abscissa_mm, diameter_mm, (across.abscissa_mm, across.curvature_per_mm))
 
 
 def over_openings(anatomy: Anatomy, nodes_mm: Floats) -> Bools:
     """Return which points (..., 3) on a device lie over restored wall, where a neck or an ostium has none."""
     face = anatomy.parent.landing_surface.closest(nodes_mm.reshape(-1, 3))[2]
     return np.asarray(anatomy.parent.is_restored_face[face].reshape(nodes_mm.shape[:-1]))
-
-
-def bend(anatomy: Anatomy) -> tuple[Floats, Floats]:
-    """Return arc lengths (m,) along the parent axis, in mm, and its curvature (m,), per mm."""
-    across = planes(anatomy.parent.axis)
-    return across.abscissa_mm, across.curvature_per_mm
 
 
 def landed_row(design: Design, size: Size, landing: Landing) -> int:
@@ -115,60 +103,36 @@ def march(design: Design, size: Size, landing: Landing, profile: Profile) -> Flo
 
     The distance from one row to the next is h(D), the row spacing at the local diameter. Row numbers are therefore the
     integral of ds / h, counted from the landing point. Where the free diameter varies along the device, D depends on
-    where its rows lie, and the rows are placed repeatedly.
-
-    Parameters
-    ----------
-    landing : where the proximal, middle or distal row lies.
-    profile : diameter and curvature along the axis.
-
-    Returns (rows,), mm: arc lengths of the rows. They may lie beyond the artery, where the diameter is taken as that
-    at its end.
+    where its rows lie, and the rows are placed repeatedly. They may lie beyond the artery, where the diameter is taken
+    as that at its end.
     """
-    rows_mm = _marched(design, size, landing, profile)
-    if not size.free_profile_mm:
-        return rows_mm
-    free_mm = free_diameters_mm(design, size)
-    for _ in range(FLARE_ROUNDS):
-        # Samples at the rows resolve a flare that is shorter than the table's step.
-        where_mm = np.union1d(profile.abscissa_mm, rows_mm)
-        diameter_mm = np.minimum(profile.at(where_mm), np.interp(where_mm, rows_mm, free_mm))
-        rows_mm = _marched(design, size, landing, replace(profile, abscissa_mm=where_mm, diameter_mm=diameter_mm))
+    shape, start = grid(design, size), landed_row(design, size, landing)
+    free_mm, rows_mm, expected = free_diameters_mm(design, size), np.zeros(shape.rows), profile
+    for done in range(1 + FLARE_ROUNDS if size.free_profile_mm else 1):
+        if done:  # samples at the rows resolve a flare that is shorter than the table's step
+            where_mm = np.union1d(expected.abscissa_mm, rows_mm)
+            diameter_mm = np.minimum(expected.at(where_mm), np.interp(where_mm, rows_mm, free_mm))
+            profile = replace(expected, abscissa_mm=where_mm, diameter_mm=diameter_mm)
+        first, last = profile.abscissa_mm[[0, -1]]
+        table_mm = np.concatenate([[first - BEYOND_MM], np.linspace(first, last, TABLE_ROWS), [last + BEYOND_MM]])
+        per_mm = shape.row_split / profile.spacing_mm(design, size, table_mm)
+        count = np.concatenate([[0.0], np.cumsum(0.5 * (per_mm[1:] + per_mm[:-1]) * np.diff(table_mm))])
+        wanted = np.interp(landing.abscissa_mm, table_mm, count) + np.arange(shape.rows) - start
+        rows_mm = np.interp(wanted, count, table_mm)
     return rows_mm
 
 
-def _marched(design: Design, size: Size, landing: Landing, profile: Profile) -> Floats:
-    """Return the arc lengths (rows,) of the rows for a profile that does not depend on where they lie, in mm."""
-    shape = grid(design, size)
-    start = landed_row(design, size, landing)
-    first, last = profile.abscissa_mm[[0, -1]]
-    table_mm = np.concatenate([[first - BEYOND_MM], np.linspace(first, last, TABLE_ROWS), [last + BEYOND_MM]])
-    per_mm = shape.row_split / profile.spacing_mm(design, size, table_mm)
-    count = np.concatenate([[0.0], np.cumsum(0.5 * (per_mm[1:] + per_mm[:-1]) * np.diff(table_mm))])
-    wanted = np.interp(landing.abscissa_mm, table_mm, count) + np.arange(shape.rows) - start
-    return np.interp(wanted, count, table_mm)
+def grown(before_mm: Floats, after_mm: Floats, free_mm: Floats) -> tuple[Floats, Bools]:
+    """Return rows (rows, columns, d) moved as far as their perimeters may grow, and which nodes that has stopped.
 
-
-@final
-@dataclass(frozen=True)
-class FreeDiameter:
-    """Limit of the perimeter of a row: it stops where it reaches that of the free device, even in a wider artery."""
-
-    diameter_mm: Floats
-    """(rows,) free diameter of every row, in mm."""
-
-    def __call__(self, before_mm: Floats, after_mm: Floats) -> tuple[Floats, Bools]:
-        """Move every row as far as its perimeter may grow.
-
-        Shapes: `before_mm, after_mm` (rows, columns, d).
-        """
-        allowed = np.pi * self.diameter_mm
-        old, new = perimeters(before_mm), perimeters(after_mm)
-        is_over = new >= allowed
-        share = np.where(is_over, (allowed - old) / np.where(is_over, np.maximum(new - old, 1e-12), 1.0), 1.0)
-        share = np.clip(share, 0.0, 1.0)[:, None, None]
-        nodes_mm = before_mm + share * (after_mm - before_mm)
-        return nodes_mm, np.broadcast_to(is_over[:, None], nodes_mm.shape[:2])
+    A row stops at its free diameter (rows,), even in a wider artery.
+    """
+    allowed = np.pi * free_mm
+    old, new = perimeters(before_mm), perimeters(after_mm)
+    is_over = new >= allowed
+    share = np.where(is_over, (allowed - old) / np.where(is_over, np.maximum(new - old, 1e-12), 1.0), 1.0)
+    nodes_mm = before_mm + np.clip(share, 0.0, 1.0)[:, None, None] * (after_mm - before_mm)
+    return nodes_mm, np.broadcast_to(is_over[:, None], nodes_mm.shape[:2])
 
 
 @final
@@ -189,106 +153,90 @@ class ConstantWire(AbstractMethod):
         """Return the closed device, its rows where they would lie if the device filled the artery."""
         profile = expected_profile(placement.design, placement.size, placement.anatomy)
         rows_mm = march(placement.design, placement.size, placement.landing, profile)
-        return Opened(placement.start(self.contour, rows_mm, _free_mm(placement)), rows_mm)
+        return Opened(placement.start(self.contour, rows_mm, placement.free_mm), rows_mm)
 
     def step(self, placement: Placement, opened: Opened) -> Opened:
         """Return the device after one step of the contour; once it is open, its row positions are recomputed."""
-        opened = self._grown(placement, opened)
-        return self._marched(placement, opened) if self.terminate(opened) else opened
-
-    def result(self, placement: Placement, opened: Opened) -> Opened:
-        """Return the device after its crossings have moved to restore the wire lengths, with its nodes at the wall.
-
-        Nodes of a laser-cut device keep the distance from the wall that its cells require.
-
-        Raises
-        ------
-        LandingError
-            The device extends beyond the artery.
-        """
-        for _ in range(LAST_STEPS):
-            if opened.contour.is_terminated.all():
-                break
-            opened = self._grown(placement, opened)
-        design, size, rows = placement.design, placement.size, np.arange(len(opened.abscissa_mm))
-        held = landed_row(design, size, placement.landing)
-        laid = partial(self._between, placement, opened)
-        is_opening = None
-        if isinstance(design, LaserCut) and design.joined_crowns:
-            is_opening = over_openings(placement.anatomy, opened.contour.nodes_mm)
-        slid = pieces.slide(design, size, opened.contour.nodes_mm, held, laid, is_opening)
-        rows_mm = pieces.extrapolated(rows, opened.abscissa_mm, slid.row.mean(axis=1))
-        check_inside(design, size, rows_mm, placement.anatomy.parent.axis.length_mm)
-        where_mm = pieces.extrapolated(rows, opened.abscissa_mm, slid.row)
-        centers_mm = placement.across.middle(where_mm.ravel()).reshape(slid.nodes_mm.shape)
-        state = opened.contour.about(centers_mm, _nearest(slid.row, len(rows)))
-        everywhere = np.ones_like(state.is_terminated)
-        if isinstance(design, LaserCut):  # the springs of its cells already limit its diameter
-            on_wall_mm = laid(slid.nodes_mm.reshape(-1, 3), slid.row.ravel(), slid.column.ravel())
-            state = replace(state, nodes_mm=on_wall_mm.reshape(slid.nodes_mm.shape) + slid.lift_mm)
-            return Opened(self.contour.classify(state, everywhere, placement.wall), rows_mm, slid.crowns)
-        state, laid_mm = self._laid(placement, replace(state, nodes_mm=slid.nodes_mm), everywhere)
-        return Opened(replace(state, nodes_mm=self._no_wider(state.nodes_mm, laid_mm, _free_mm(placement))), rows_mm)
-
-    def _between(self, placement: Placement, opened: Opened, points_mm: Floats, row: Floats, column: Floats) -> Floats:
-        """Return (n, 3) points between the nodes, put on the wall like their nearest node, in mm."""
-        contour = opened.contour
-        rows, columns = (
-            _nearest(row, contour.nodes_mm.shape[0]),
-            np.rint(column).astype(int) % contour.nodes_mm.shape[1],
-        )
-        where_mm = pieces.extrapolated(np.arange(len(opened.abscissa_mm)), opened.abscissa_mm, row)
-        state = contour.near(points_mm, placement.across.middle(where_mm), rows, columns)
-        # Points of rows that stopped at the free diameter stay in place unless they are outside the wall.
-        is_narrow = perimeters(contour.nodes_mm) < FREELY * np.pi * _free_mm(placement)
-        state = replace(state, is_terminated=state.is_terminated & is_narrow[rows, None])
-        return self._laid(placement, state, np.ones_like(state.is_terminated))[1].reshape(-1, 3)
-
-    @staticmethod
-    def _no_wider(slid_mm: Floats, laid_mm: Floats, free_mm: Floats) -> Floats:
-        """Return rows on the wall as far as their diameter, seen along the device, does not exceed the free one."""
-        old, new = row_diameters_mm(slid_mm), row_diameters_mm(laid_mm)
-        share = np.where(new > free_mm, (free_mm - old) / np.maximum(new - old, 1e-12), 1.0)
-        nodes_mm = slid_mm + np.clip(share, 0.0, 1.0)[:, None, None] * (laid_mm - slid_mm)
-        middle_mm = nodes_mm.mean(axis=1, keepdims=True)
-        shrunk = np.minimum(free_mm / row_diameters_mm(nodes_mm), 1.0)[:, None, None]
-        return middle_mm + shrunk * (nodes_mm - middle_mm)
-
-    def _grown(self, placement: Placement, opened: Opened) -> Opened:
-        """Return the device after one step of the contour; a row that reaches the free diameter stops there."""
-        before, after = opened.contour, self.contour.step(opened.contour, placement.wall)
-        free = FreeDiameter(_free_mm(placement))
-        nodes_mm, is_stopped = free(before.nodes_mm, after.nodes_mm)
-        after = replace(after, nodes_mm=nodes_mm, is_terminated=after.is_terminated | is_stopped)
-        return replace(opened, contour=after)
-
-    def _marched(self, placement: Placement, opened: Opened) -> Opened:
-        """Return the device with its rows moved according to their measured diameters until they have converged."""
-        design, size, axis = placement.design, placement.size, placement.anatomy.parent.axis
+        opened = self._stepped(placement, opened)
+        if not self.terminate(opened):
+            return opened
+        design, size, artery_mm = placement.design, placement.size, placement.anatomy.parent.axis.length_mm
         profile = expected_profile(design, size, placement.anatomy)
         for done in range(ROUNDS):
             profile = profile.corrected(opened.abscissa_mm, perimeters(opened.contour.nodes_mm) / np.pi)
             rows_mm = march(design, size, placement.landing, profile)
-            check_inside(design, size, rows_mm, axis.length_mm)
+            check_inside(design, size, rows_mm, artery_mm)
             if done and np.abs(rows_mm - opened.abscissa_mm).max() < SETTLED_MM:
                 break
             opened = self._moved(placement, opened, rows_mm)
         return opened
 
+    def result(self, placement: Placement, opened: Opened) -> Opened:
+        """Return the device after its crossings have moved to restore the wire lengths, with its nodes at the wall.
+
+        Nodes of a laser-cut device keep the distance from the wall that its cells require. A LandingError is raised
+        where the device extends beyond the artery.
+        """
+        for _ in range(LAST_STEPS):
+            if opened.contour.is_terminated.all():
+                break
+            opened = self._stepped(placement, opened)
+        design, size, rows = placement.design, placement.size, np.arange(len(opened.abscissa_mm))
+        held = landed_row(design, size, placement.landing)
+        laid = partial(self._between, placement, opened)
+        is_opening = over_openings(placement.anatomy, opened.contour.nodes_mm) if design.joined_crowns else None
+        slid = pieces.slide(design, size, opened.contour.nodes_mm, held, laid, is_opening)
+        rows_mm = pieces.extrapolated(rows, opened.abscissa_mm, slid.row.mean(axis=1))
+        check_inside(design, size, rows_mm, placement.anatomy.parent.axis.length_mm)
+        where_mm = pieces.extrapolated(rows, opened.abscissa_mm, slid.row)
+        centers_mm = placement.across.middle(where_mm.ravel()).reshape(slid.nodes_mm.shape)
+        state = opened.contour.about(centers_mm, pieces.nearest(slid.row, len(rows)))
+        everywhere = np.ones_like(state.is_terminated)
+        if not design.follows_bends:  # the springs of its cells already limit its diameter
+            on_wall_mm = laid(slid.nodes_mm.reshape(-1, 3), slid.row.ravel(), slid.column.ravel())
+            state = replace(state, nodes_mm=on_wall_mm.reshape(slid.nodes_mm.shape) + slid.lift_mm)
+            return Opened(self.contour.classify(state, everywhere, placement.wall), rows_mm, slid.crowns)
+        state, laid_mm = self._laid(placement, replace(state, nodes_mm=slid.nodes_mm), everywhere)
+        # Rows on the wall are no wider than the free device, seen along it.
+        slid_mm, free_mm = state.nodes_mm, placement.free_mm
+        old, new = row_diameters_mm(slid_mm), row_diameters_mm(laid_mm)
+        share = np.where(new > free_mm, (free_mm - old) / np.maximum(new - old, 1e-12), 1.0)
+        nodes_mm = slid_mm + np.clip(share, 0.0, 1.0)[:, None, None] * (laid_mm - slid_mm)
+        middle_mm = nodes_mm.mean(axis=1, keepdims=True)
+        shrunk = np.minimum(free_mm / row_diameters_mm(nodes_mm), 1.0)[:, None, None]
+        return Opened(replace(state, nodes_mm=middle_mm + shrunk * (nodes_mm - middle_mm)), rows_mm)
+
+    def _between(self, placement: Placement, opened: Opened, points_mm: Floats, row: Floats, column: Floats) -> Floats:
+        """Return (n, 3) points between the nodes, put on the wall like their nearest node, in mm."""
+        contour, (n, columns) = opened.contour, opened.contour.nodes_mm.shape[:2]
+        rows = pieces.nearest(row, n)
+        where_mm = pieces.extrapolated(np.arange(n), opened.abscissa_mm, row)
+        state = contour.near(points_mm, placement.across.middle(where_mm), rows, np.rint(column).astype(int) % columns)
+        # Points of rows that stopped at the free diameter stay in place unless they are outside the wall.
+        is_narrow = perimeters(contour.nodes_mm) < FREELY * np.pi * placement.free_mm
+        state = replace(state, is_terminated=state.is_terminated & is_narrow[rows, None])
+        return self._laid(placement, state, np.ones_like(state.is_terminated))[1].reshape(-1, 3)
+
+    def _stepped(self, placement: Placement, opened: Opened) -> Opened:
+        """Return the device after one step of the contour; a row that reaches the free diameter stops there."""
+        before, after = opened.contour, self.contour.step(opened.contour, placement.wall)
+        nodes_mm, is_stopped = grown(before.nodes_mm, after.nodes_mm, placement.free_mm)
+        after = replace(after, nodes_mm=nodes_mm, is_terminated=after.is_terminated | is_stopped)
+        return replace(opened, contour=after)
+
     def _moved(self, placement: Placement, opened: Opened, rows_mm: Floats) -> Opened:
         """Return the device with its rows at `rows_mm` (rows,), its shape kept and its nodes evenly spaced."""
         across, state, before_mm = placement.across, opened.contour, opened.abscissa_mm
         in_plane_mm = evenly_spaced(across.coordinates(before_mm, state.nodes_mm))
-        nodes_mm = across.place(rows_mm, _interpolated(before_mm, in_plane_mm, rows_mm))
+        inside_mm = np.clip(rows_mm, before_mm[0], before_mm[-1])
+        nodes_mm = across.place(rows_mm, pieces.extrapolated(before_mm, in_plane_mm, inside_mm))
         near = np.rint(np.interp(rows_mm, before_mm, np.arange(len(before_mm)))).astype(int)
         centers_mm = np.broadcast_to(across.middle(rows_mm)[:, None], nodes_mm.shape)
         state = state.about(centers_mm, np.broadcast_to(near[:, None], nodes_mm.shape[:2]))
         # Only rows beyond the old ends have no measured shape: they are put to the wall now, all others in `result`.
-        is_beyond = (rows_mm < before_mm[0]) | (rows_mm > before_mm[-1])
-        is_asked = np.broadcast_to(is_beyond[:, None], nodes_mm.shape[:2])
+        is_asked = np.broadcast_to((rows_mm != inside_mm)[:, None], nodes_mm.shape[:2])
         state, laid_mm = self._laid(placement, replace(state, nodes_mm=nodes_mm), is_asked)
-        free = FreeDiameter(_free_mm(placement))
-        return Opened(replace(state, nodes_mm=free(state.nodes_mm, laid_mm)[0]), rows_mm)
+        return Opened(replace(state, nodes_mm=grown(state.nodes_mm, laid_mm, placement.free_mm)[0]), rows_mm)
 
     def _laid(self, placement: Placement, state: State, is_asked: Bools) -> tuple[State, Floats]:
         """Return the contour with the nodes in `is_asked` inside the wall, and all nodes as they lie on the wall."""
@@ -299,20 +247,3 @@ class ConstantWire(AbstractMethod):
         is_off = held.ravel() & (state.contact.distance_mm > self.contour.dd_mm)
         back_mm = self.contour.relocated_mm(points_mm, np.zeros_like(is_off), state.contact)
         return state, np.where(is_off[:, None], back_mm, points_mm).reshape(state.nodes_mm.shape)
-
-
-def _free_mm(placement: Placement) -> Floats:
-    """Return the free diameter of every row of a device (rows,), in mm."""
-    return free_diameters_mm(placement.design, placement.size)
-
-
-def _nearest(row: Floats, rows: int) -> Ints:
-    """Return the row of nodes nearest to each fractional row."""
-    return np.clip(np.rint(row), 0, rows - 1).astype(int)
-
-
-def _interpolated(old_mm: Floats, values: Floats, new_mm: Floats) -> Floats:
-    """Return values (k, m, d) at `new_mm` (k,), linear between known values (n, m, d) and constant beyond them."""
-    i = np.clip(np.searchsorted(old_mm, new_mm, side="right") - 1, 0, len(old_mm) - 2)
-    share = np.clip((new_mm - old_mm[i]) / (old_mm[i + 1] - old_mm[i]), 0.0, 1.0)[:, None, None]
-    return (1 - share) * values[i] + share * values[i + 1]

@@ -25,8 +25,9 @@ import numpy as np
 from scipy.sparse import coo_matrix, csc_matrix, diags, identity, kron, vstack
 from scipy.sparse.linalg import spsolve
 
-from vstent.deployment.crowns import Split
-from vstent.kernels.arrays import Bools, Floats, Ints
+from vstent.deployment.contour import bilinear
+from vstent.deployment.crowns import Split, around_rings
+from vstent.kernels.arrays import Floats, Ints
 from vstent.kernels.net import Net
 
 Laid = Callable[[Floats, Floats, Floats], Floats]
@@ -62,15 +63,6 @@ STUCK: Final = 1e3
 """Damping above which no further step is tried."""
 TINY_MM: Final = 0.02
 """Step of the central differences by which joint positions are differentiated, in mm."""
-
-
-class Cut(NamedTuple):
-    """Free crowns of an open-cell device."""
-
-    split: Split
-    """Net of the device, split at its free crowns."""
-    is_over_opening: Bools
-    """(j,) free crowns over a neck or an ostium, where no wall holds them."""
 
 
 class _Frame(NamedTuple):
@@ -124,16 +116,14 @@ class _Model(NamedTuple):
 
 
 def relax(
-    net: Net, length_mm: float, width_mm: Floats, joint_mm: float, held: float, laid: Laid, cut: Cut | None = None
+    net: Net, length_mm: float, width_mm: Floats, joint_mm: float, held: float, laid: Laid, split: Split | None = None
 ) -> Floats:
-    """Compute the moves that restore the strut lengths of a laser-cut device.
+    """Compute the moves (joints, 3) that restore the strut lengths of a laser-cut device with the nets of `split`.
 
-    Shapes: `width_mm` (rows,).
+    The free device is `width_mm` (rows,) wide between neighbouring joints of a row, and a joint is `joint_mm` wide. The
+    row of joints `held`, a fraction, stays in place.
     """
-    if cut is None:
-        frame = _closed_frame(net, length_mm, width_mm, joint_mm, held, laid)
-    else:
-        frame = _open_frame(cut, length_mm, width_mm, joint_mm, held, laid)
+    frame = _frame(net, length_mm, width_mm, joint_mm, held, laid, split)
     x, inertia = np.zeros(3 * len(frame.net.line)), INERTIA
     here = _model(frame, x)
     for _ in range(STEPS):
@@ -152,34 +142,33 @@ def relax(
     return x.reshape(-1, 3)
 
 
-def _closed_frame(net: Net, length_mm: float, width_mm: Floats, joint_mm: float, held: float, laid: Laid) -> _Frame:
-    """Return the least-squares problem of a device whose crowns are all joined."""
-    pairs, free_mm = _diagonals(net, length_mm, width_mm)
-    none = _Tips(np.zeros((3, 0), dtype=int), np.zeros((0, 3)), np.zeros(0))
-    on_wall_mm = np.zeros(len(net.line))
-    alike, keeping = np.ones(len(free_mm)), _keeping(net, held)
-    return _Frame(net, laid, length_mm, pairs, free_mm, joint_mm, alike, on_wall_mm, none, keeping)
-
-
-def _open_frame(cut: Cut, length_mm: float, width_mm: Floats, joint_mm: float, held: float, laid: Laid) -> _Frame:
-    """Return the least-squares problem of a device with free crowns."""
-    net, split = cut.split.net, cut.split
+def _frame(
+    net: Net, length_mm: float, width_mm: Floats, joint_mm: float, held: float, laid: Laid, split: Split | None
+) -> _Frame:
+    """Return the least-squares problem of a device; `split` has its free crowns, None: all crowns are joined."""
     height_mm = 2 * np.sqrt(length_mm**2 - (0.5 * width_mm) ** 2)
-    free_mm = np.where(split.is_width, width_mm[split.pair_line], height_mm[split.pair_line])
-    lowest_mm = np.where(cut.is_over_opening, -OUTWARD_MM, 0.0)
-    ring = _ring(split.rings, len(net.line), np.where(split.is_free[split.rings[1]], LEVEL, BENDING))
-    keeping = _keeping(net, held, ring)
-    springs = split.pairs, free_mm, joint_mm, split.pair_weight
-    return _Frame(net, laid, length_mm, *springs, lowest_mm, _tips(split), keeping)
+    if split is None:
+        n, lower = len(net.line), net.gaps[0]
+        pairs = np.concatenate([np.stack([np.arange(n), net.beside]), net.gaps], axis=1)
+        free_mm = np.concatenate([width_mm[net.line], height_mm[net.line[lower] + 1]])
+        weight, lowest_mm = np.ones(len(free_mm)), np.zeros(n)
+        tips = _Tips(np.zeros((3, 0), dtype=int), np.zeros((0, 3)), np.zeros(0))
+        rings, stiffness = around_rings(net.beside.astype(int)), np.full(n, BENDING)
+    else:
+        net, pairs, weight, rings = split.net, split.pairs, split.pair_weight, split.rings
+        free_mm = np.where(split.is_width, width_mm[split.pair_line], height_mm[split.pair_line])
+        lowest_mm = np.where(split.is_over_opening, -OUTWARD_MM, 0.0)
+        tips = _tips(split)
+        stiffness = np.where(split.is_free[rings[1]], LEVEL, BENDING)
+    ring = diags(stiffness) @ _bends(rings, len(net.line))
+    return _Frame(net, laid, length_mm, pairs, free_mm, joint_mm, weight, lowest_mm, tips, _keeping(net, held, ring))
 
 
 def _tips(split: Split) -> _Tips:
     """Return the free tips of a device with what they are on a straight tube."""
     net, base = split.net, split.tips[1]
     points_mm = positions_mm(net, np.zeros((len(net.line), 3)), as_drawn)
-    beside = net.beside.astype(int)
-    before = np.zeros(len(beside), dtype=int)
-    before[beside] = np.arange(len(beside))
+    before, _, beside = around_rings(net.beside.astype(int))
     chart = net.chart[net.row[base], net.column[base]]
     outward = np.cross(chart[:, 6:], chart[:, 3:6])
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
@@ -191,19 +180,14 @@ def _tips(split: Split) -> _Tips:
 def _stepped(frame: _Frame, here: _Model, x: Floats, inertia: float) -> Floats:
     """Return the moves (3 c,) after one damped step from moves x (3 c,), none of them outside the wall."""
     downhill = -here.slopes.T @ here.residual
-    free = np.flatnonzero(~_is_pressed(x, downhill, frame.lowest_mm))
+    is_pressed = np.zeros(len(x), dtype=bool)  # joints on the wall that the step would push through it
+    is_pressed[2::3] = (x[2::3] <= frame.lowest_mm) & (downhill[2::3] <= 0)
+    free = np.flatnonzero(~is_pressed)
     slopes = here.slopes[:, free]
     tried = x.copy()
     tried[free] += spsolve(csc_matrix(slopes.T @ slopes + inertia * identity(len(free))), downhill[free])
     tried[2::3] = np.maximum(tried[2::3], frame.lowest_mm)
     return tried
-
-
-def _is_pressed(x: Floats, downhill: Floats, lowest_mm: Floats) -> Bools:
-    """Return which moves (3 c,) belong to joints on the wall that the step would push through it."""
-    pressed = np.zeros(len(x), dtype=bool)
-    pressed[2::3] = (x[2::3] <= lowest_mm) & (downhill[2::3] <= 0)
-    return pressed
 
 
 def _model(frame: _Frame, x: Floats) -> _Model:
@@ -255,15 +239,9 @@ def as_drawn(points_mm: Floats, row: Floats, column: Floats) -> Floats:
 
 def positions_mm(net: Net, moves: Floats, laid: Laid) -> Floats:
     """Return the positions (c, 3) of the joints after moves (c, 3), in mm."""
-    rows, columns = net.chart.shape[:2]
     along = net.row + moves[:, 0] / net.spacing[0]
     around = net.column + moves[:, 1] / net.spacing[1]
-    i, j = np.clip(np.floor(along).astype(int), 0, rows - 2), np.floor(around).astype(int)
-    down, right = (along - i)[:, None], (around - j)[:, None]
-    j, beyond = j % columns, (j + 1) % columns
-    above = (1 - right) * net.chart[i, j] + right * net.chart[i, beyond]
-    below = (1 - right) * net.chart[i + 1, j] + right * net.chart[i + 1, beyond]
-    found = (1 - down) * above + down * below
+    found = bilinear(net.chart, along, around)
     outward = np.cross(found[:, 6:], found[:, 3:6])
     on_wall_mm = laid(found[:, :3], along, around)
     return on_wall_mm - moves[:, 2:] * outward / np.linalg.norm(outward, axis=1, keepdims=True)
@@ -282,39 +260,23 @@ def _lengths(points_mm: Floats, change: Floats, ends: Ints, bulge_mm2: Floats) -
     return length_mm, coo_matrix((np.concatenate(slopes).ravel(), (piece, move)), shape=shape)
 
 
-def _diagonals(net: Net, length_mm: float, width_mm: Floats) -> tuple[Ints, Floats]:
-    """Return the joints at both ends of every cell's width and height (2, k), and their free distances (k,) in mm."""
-    stride, n = net.chart.shape[1], len(net.line)
-    key = net.line.astype(int) * stride + net.column
-    ahead = np.searchsorted(key, key + 2 * stride)
-    lower = np.flatnonzero(ahead < n)
-    pairs = np.concatenate([np.stack([np.arange(n), net.beside]), np.stack([lower, ahead[lower]])], axis=1)
-    height_mm = 2 * np.sqrt(length_mm**2 - (0.5 * width_mm) ** 2)
-    return pairs, np.concatenate([width_mm[net.line], height_mm[net.line[lower] + 1]])
+def _bends(triples: Ints, n: int) -> coo_matrix:
+    """Return the second differences (k, n) of n joints along triples (3, k) of consecutive ones."""
+    k = triples.shape[1]
+    return coo_matrix((np.repeat([1.0, -2.0, 1.0], k), (np.tile(np.arange(k), 3), triples.ravel())), shape=(k, n))
 
 
-def _ring(rings: Ints, n: int, weight: Floats) -> coo_matrix:
-    """Return the weighted second differences (r, n) of n joints along rings of consecutive joints (3, r)."""
-    number = np.tile(np.arange(rings.shape[1]), 3)
-    return coo_matrix((np.concatenate([weight, -2 * weight, weight]), (number, rings.ravel())), (rings.shape[1], n))
-
-
-def _keeping(net: Net, held: float, ring: coo_matrix | None = None) -> csc_matrix:
+def _keeping(net: Net, held: float, ring: csc_matrix) -> csc_matrix:
     """Return the matrix (k, 3 c) of the penalties on moves out of a row or around, on bending, and on the held row.
 
-    `ring` (r, c) holds the weighted second differences around the rings of an open-cell device.
+    `ring` (r, c) holds the weighted second differences around the rings.
     """
-    n, bends = len(net.line), net.bends.astype(int)
+    n = len(net.line)
     member = coo_matrix((np.ones(n), (net.line, np.arange(n)))).tocsr()
     mean = diags(1 / np.bincount(net.line)) @ member
     off_row = identity(n) - member.T @ mean
-    lines = np.arange(mean.shape[0])
-    anchor = csc_matrix(np.maximum(1 - np.abs(lines - held), 0.0)) @ mean
-    weights, number = np.repeat([1.0, -2.0, 1.0], bends.shape[1]), np.tile(np.arange(bends.shape[1]), 3)
-    line = coo_matrix((weights, (number, bends.ravel())), shape=(bends.shape[1], n))
-    if ring is None:
-        beside = coo_matrix((np.ones(n), (np.arange(n), net.beside.astype(int))), shape=(n, n))
-        ring = BENDING * (beside - 2 * identity(n) + beside.T)
+    anchor = csc_matrix(np.maximum(1 - np.abs(np.arange(mean.shape[0]) - held), 0.0)) @ mean
+    line = _bends(net.bends.astype(int), n)
     along, around, off = (csc_matrix(np.eye(3)[[k]]) for k in range(3))
     level = [LEVEL * kron(off_row, along), LEVEL * kron(identity(n), around), kron(anchor, along)]
     smooth = [STIFFNESS * kron(line, along), STIFFNESS * kron(line, around), BENDING * kron(line, off)]

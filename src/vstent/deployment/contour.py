@@ -173,3 +173,15 @@ def normals(nodes_mm: Floats) -> Floats:
     around = np.roll(nodes_mm, -1, axis=1) - np.roll(nodes_mm, 1, axis=1)
     normal = np.cross(around, along)
     return normal / np.maximum(curves.lengths(normal), 1e-300)[..., None]
+
+
+def bilinear(grid_values: Floats, row: Floats, column: Floats) -> Floats:
+    """Return bilinear values (..., d) of a grid (n, m, d), periodic in columns, extrapolated linearly beyond rows."""
+    n, m = grid_values.shape[:2]
+    i = np.clip(np.floor(row).astype(int), 0, n - 2)
+    j = np.floor(column).astype(int)
+    down, right = (row - i)[..., None], (column - j)[..., None]
+    j, beyond = j % m, (j + 1) % m
+    above = (1 - right) * grid_values[i, j] + right * grid_values[i, beyond]
+    below = (1 - right) * grid_values[i + 1, j] + right * grid_values[i + 1, beyond]
+    return (1 - down) * above + down * below

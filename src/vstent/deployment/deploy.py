@@ -6,9 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from vstent.deployment import sizing, wires
-from vstent.deployment.advice import Gaps, advise
+from vstent.deployment.advice import advise
 from vstent.deployment.braid import ConstantWire
-from vstent.deployment.crowns import shifts_mm
 from vstent.deployment.evenly_spaced import Zhong2016
 from vstent.deployment.method import AbstractMethod, Course, Placement, Progress, laid_inside, run
 from vstent.deployment.wall import landing_wall
@@ -93,14 +92,13 @@ def deploy(
     nodes_mm = course.opened.contour.nodes_mm
     crowns = course.opened.crowns
     drawn = wires.draw(design, size, nodes_mm, wall, crowns)
-    stent = Stent(design, size, nodes_mm, course.opened.abscissa_mm, *drawn, shifts_mm(crowns))
+    stent = Stent(design, size, nodes_mm, course.opened.abscissa_mm, *drawn, crowns.shift_mm)
     contact = wall.contact(nodes_mm.reshape(-1, 3))
     gap_mm = np.maximum(contact.distance_mm - chosen.contour.dd_mm, 0.0).reshape(nodes_mm.shape[:2])
-    is_at_patient = is_patient[contact.face].reshape(gap_mm.shape)
     return Deployment(
         stent=stent,
         outcome=course.outcome,
-        advice=advise(anatomy, stent, course, Gaps(gap_mm, is_at_patient)),
+        advice=advise(anatomy, stent, course, gap_mm, is_patient[contact.face].reshape(gap_mm.shape)),
         terminated_fraction=np.array(course.terminated_fraction),
         seconds=time.perf_counter() - began,
         wall_gap_mm=gap_mm,

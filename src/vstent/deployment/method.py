@@ -10,10 +10,10 @@ import numpy as np
 
 from vstent.deployment.active_contour import ActiveContour, State
 from vstent.deployment.contour import Planes, circles, planes
-from vstent.deployment.crowns import Crowns
+from vstent.deployment.crowns import NO_CROWNS, Crowns
 from vstent.deployment.wall import AbstractWall
 from vstent.devices.design import Design, Size
-from vstent.devices.formulas import grid
+from vstent.devices.formulas import free_diameters_mm, grid
 from vstent.devices.stent import Landing
 from vstent.errors import InputError, LandingError
 from vstent.geometry.vessel import Anatomy
@@ -58,6 +58,11 @@ class Placement:
         """Planes across the parent axis that hold the rows."""
         return planes(self.anatomy.parent.axis)
 
+    @property
+    def free_mm(self) -> Floats:
+        """(rows,) free diameter of every row, in mm."""
+        return free_diameters_mm(self.design, self.size)
+
     def start(self, contour: ActiveContour, rows_mm: Floats, widest_mm: Floats | float = np.inf) -> State:
         """Create the closed contour from circles of the maximum inscribed spheres.
 
@@ -93,7 +98,7 @@ class Opened:
     """Its contour."""
     abscissa_mm: Floats
     """(rows,) arc length of every row on the parent axis, in mm."""
-    crowns: Crowns | None = None
+    crowns: Crowns = NO_CROWNS
     """Free crowns of an open-cell device, once it is deployed."""
 
 

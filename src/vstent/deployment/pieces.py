@@ -19,9 +19,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from vstent.deployment import cells
-from vstent.deployment.contour import normals
-from vstent.deployment.crowns import Crowns, free_crowns, split
-from vstent.devices.design import Braid, Design, LaserCut, Size, piece_length_mm
+from vstent.deployment.contour import bilinear, normals
+from vstent.deployment.crowns import NO_CROWNS, Crowns, Split, free_crowns, split
+from vstent.devices.design import Design, LaserCut, Size, piece_length_mm
 from vstent.devices.formulas import Grid, free_diameters_mm, grid, row_spacing_mm
 from vstent.kernels import net
 from vstent.kernels.arrays import Bools, Floats, Ints
@@ -54,7 +54,7 @@ class Slid(NamedTuple):
     """(rows, columns) fractional column of the original contour at which each node lies."""
     lift_mm: Floats
     """(rows, columns, 3) displacement of each node from the wall into the lumen, in mm; not included in `nodes_mm`."""
-    crowns: Crowns | None = None
+    crowns: Crowns = NO_CROWNS
     """Free crowns of an open-cell device."""
 
 
@@ -63,38 +63,22 @@ def slide(
 ) -> Slid:
     """Move the crossings of a device along its contour until the pieces of wire have their length.
 
-    Nodes between crossings move with them.
-
-    Parameters
-    ----------
-    nodes_mm : (rows, columns, 3), mm; contour before the crossings move.
-    held : row of nodes whose mean position along the device stays the same.
-    laid : puts points between the contour's nodes on the wall. Only laser-cut devices use it.
-    is_opening : (rows, columns); nodes over a neck or an ostium, where free crowns of open cells may leave the artery.
-
-    Returns the contour after the crossings have moved.
+    Nodes (rows, columns, 3) between crossings move with them, and the mean position of the row `held` stays the same.
+    For laser-cut devices, `laid` puts points between nodes on the wall, and free crowns of open cells may leave the
+    artery where `is_opening` (rows, columns), over a neck or an ostium.
     """
     shape = grid(design, size)
-    continued_mm = _continued(nodes_mm)
+    middle_mm = nodes_mm.mean(axis=1)
+    before = nodes_mm[:1] - (middle_mm[1] - middle_mm[0])  # one more row at each end, because tilted ends reach beyond
+    behind = nodes_mm[-1:] + (middle_mm[-1] - middle_mm[-2])
+    continued_mm = np.concatenate([before, nodes_mm, behind])
     along_mm = np.gradient(continued_mm, axis=0)
     around_mm = 0.5 * (np.roll(continued_mm, -1, axis=1) - np.roll(continued_mm, 1, axis=1))
     spacing_mm = np.array([np.median(np.linalg.norm(side, axis=2)) for side in (along_mm, around_mm)])
     chart = np.concatenate([continued_mm, along_mm / spacing_mm[0], around_mm / spacing_mm[1]], axis=2)
-    lattice = _lattice(shape)
-    pieces = net.Net(
-        chart,
-        lattice.row + 1,
-        lattice.column,
-        lattice.line,
-        lattice.beside,
-        lattice.ends,
-        spacing_mm,
-        _bulge_mm2(nodes_mm[:: shape.row_split, :: shape.column_split]),
-        lattice.bends,
-        lattice.gaps,
-    )
-    length_mm, held_line = piece_length_mm(design, size), held / shape.row_split
-    crowns = None
+    bulge_mm2 = _bulge_mm2(nodes_mm[:: shape.row_split, :: shape.column_split])
+    crossings = _lattice(shape)._replace(chart=chart, spacing=spacing_mm, bulge=bulge_mm2)
+    length_mm, held_line, crowns = piece_length_mm(design, size), held / shape.row_split, NO_CROWNS
     if isinstance(design, LaserCut):
 
         def on_wall(points_mm: Floats, row: Floats, column: Floats) -> Floats:
@@ -103,53 +87,41 @@ def slide(
         free_mm = free_diameters_mm(design, size)[:: shape.row_split]
         width_mm = free_mm * np.sin(2 * np.pi / design.n_columns)
         joint_mm = 2 * design.strut_width_um * MM_PER_UM  # two struts, side by side
-        cut = _cut(design, shape, pieces, is_opening) if design.joined_crowns else None
-        moves_mm = cells.relax(pieces, length_mm, width_mm, joint_mm, held_line, on_wall, cut)
-        if cut is not None:
-            moves_mm, crowns = _parted(pieces, cut, moves_mm, on_wall, shape)
+        divided = None
+        if design.joined_crowns:
+            is_free = free_crowns(design, shape)[crossings.line, crossings.column // shape.column_split]
+            over = np.zeros_like(is_free) if is_opening is None else is_opening[crossings.row - 1, crossings.column]
+            divided = split(crossings, is_free, over)
+        moves_mm = cells.relax(crossings, length_mm, width_mm, joint_mm, held_line, on_wall, divided)
+        if divided is not None:
+            moves_mm, crowns = _parted(crossings, divided, moves_mm, on_wall, shape)
     else:
-        weights = net.Weights(
-            length_mm, RESISTANCE, CROWDING, STIFFNESS, round(held_line), _shortest_cell_mm(design, size)
-        )
-        moves_mm = np.pad(net.slide(pieces, weights, DESCENT), ((0, 0), (0, 1)))
-    rows, columns, off_mm = (_spread(moves, lattice, shape) for moves in (moves_mm / [*spacing_mm, 1.0]).T)
+        # The wires of a short cell are nearly perpendicular to the axis: its length is the distance between them.
+        mean_mm = sum(count * diameter_um for count, diameter_um in design.wires) / design.n_wires * MM_PER_UM
+        shortest_mm = min(JAMMED * mean_mm, 2 * float(row_spacing_mm(design, size, size.free_diameter_mm)))
+        weights = net.Weights(length_mm, RESISTANCE, CROWDING, STIFFNESS, round(held_line), shortest_mm)
+        moves_mm = np.pad(net.slide(crossings, weights, DESCENT), ((0, 0), (0, 1)))
+    rows, columns, off_mm = (_spread(moves, crossings, shape) for moves in (moves_mm / [*spacing_mm, 1.0]).T)
     row, column = np.arange(shape.rows)[:, None] + rows - rows[held].mean(), np.arange(shape.columns) + columns
-    lift_mm = -off_mm[..., None] * _bilinear(normals(continued_mm), row + 1, column)
-    return Slid(_bilinear(continued_mm, row + 1, column), row, column, lift_mm, crowns)
-
-
-def _cut(design: LaserCut, shape: Grid, pieces: net.Net, is_opening: Bools | None) -> cells.Cut:
-    """Return the free crowns of an open-cell device."""
-    line, column = pieces.line.astype(int), pieces.column // shape.column_split
-    divided = split(pieces, free_crowns(design, shape)[line, column])
-    if is_opening is None:
-        return cells.Cut(divided, np.zeros(len(divided.crossing), dtype=bool))
-    is_over = is_opening[pieces.row - 1, pieces.column][divided.crossing]
-    return cells.Cut(divided, divided.is_free & is_over)
+    lift_mm = -off_mm[..., None] * bilinear(normals(continued_mm), row + 1, column)
+    return Slid(bilinear(continued_mm, row + 1, column), row, column, lift_mm, crowns)
 
 
 def _parted(
-    pieces: net.Net, cut: cells.Cut, moves_mm: Floats, on_wall: cells.Laid, shape: Grid
+    crossings: net.Net, divided: Split, moves_mm: Floats, on_wall: cells.Laid, shape: Grid
 ) -> tuple[Floats, Crowns]:
     """Return the moves (c, 3) of the crossings, in mm, and the free crowns relative to them."""
-    crown = cut.split.crown
+    crown = divided.crown
     mean_mm = 0.5 * (moves_mm[crown[0]] + moves_mm[crown[1]])
     mean_mm[:, 2] = np.maximum(mean_mm[:, 2], 0.0)  # the contour of the device stays in the artery
-    at_mm = cells.positions_mm(pieces, mean_mm, on_wall)
-    tips_mm = cells.positions_mm(cut.split.net, moves_mm, on_wall)
-    line, column = pieces.line.astype(int), pieces.column // shape.column_split
+    at_mm = cells.positions_mm(crossings, mean_mm, on_wall)
+    tips_mm = cells.positions_mm(divided.net, moves_mm, on_wall)
+    line, column = crossings.line, crossings.column // shape.column_split
     shift_mm = np.zeros((2, shape.lattice_rows, shape.lattice_columns, 3))
     shift_mm[:, line, column] = tips_mm[crown] - at_mm
     is_over_opening = np.zeros(shift_mm.shape[1:3], dtype=bool)
-    is_over_opening[line, column] = cut.is_over_opening[crown[0]]
+    is_over_opening[line, column] = divided.is_over_opening[crown[0]]
     return mean_mm, Crowns(shift_mm, is_over_opening)
-
-
-def _shortest_cell_mm(design: Braid, size: Size) -> float:
-    """Return the length along the device at which the wires of a cell touch, at most that of a free cell, in mm."""
-    # The wires of a short cell are nearly perpendicular to the axis: its length is the distance between them.
-    mean_mm = sum(count * diameter_um for count, diameter_um in design.wires) / design.n_wires * MM_PER_UM
-    return min(JAMMED * mean_mm, 2 * float(row_spacing_mm(design, size, size.free_diameter_mm)))
 
 
 def _bulge_mm2(nodes_mm: Floats) -> Floats:
@@ -160,28 +132,12 @@ def _bulge_mm2(nodes_mm: Floats) -> Floats:
     return 16 / 3 * ((bend_mm / 16) ** 2).sum(axis=2).mean(axis=1)
 
 
-class _Lattice(NamedTuple):
-    """Crossings of a device and the pieces of wire between them."""
-
-    line: Ints
-    """(c,) lattice row of every crossing."""
-    row: Ints
-    """(c,) row of nodes of every crossing."""
-    column: Ints
-    """(c,) column of nodes of every crossing."""
-    beside: Ints
-    """(c,) next crossing in the same row."""
-    ends: Ints
-    """(2, p) crossings at the two ends of every piece of wire."""
-    bends: Ints
-    """(3, b) all triples of consecutive crossings on a wire."""
-    gaps: Ints
-    """(2, g) crossings at the proximal and distal end of every cell, two rows apart."""
-
-
 @cache
-def _lattice(shape: Grid) -> _Lattice:
-    """Return the crossings of a grid: they lie where the lattice row and column are both even or both odd."""
+def _lattice(shape: Grid) -> net.Net:
+    """Return the crossings of a grid, without chart: they lie where lattice row and column are both even or both odd.
+
+    Their rows are those of a contour with one more row at each end.
+    """
     rows, columns = shape.lattice_rows, shape.lattice_columns
     line, column = np.nonzero(np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 0)
     number = np.full((rows, columns), -1)
@@ -197,36 +153,26 @@ def _lattice(shape: Grid) -> _Lattice:
     bends = np.array(ways).transpose(1, 2, 0).reshape(3, -1)
     near = np.flatnonzero(line < rows - 2)
     gaps = np.stack([near, number[line[near] + 2, column[near]]])
-    row, column = line * shape.row_split, column * shape.column_split
-    numbers = [values.astype(np.uint32, order="C") for values in (line, beside, both, bends, gaps)]
-    return _Lattice(numbers[0], row, column, *numbers[1:])
-
-
-def _continued(nodes_mm: Floats) -> Floats:
-    """Return the contour with one extra row (rows + 2, columns, 3) at each end, because tilted ends reach beyond it."""
-    middle_mm = nodes_mm.mean(axis=1)
-    before = nodes_mm[:1] - (middle_mm[1] - middle_mm[0])
-    behind = nodes_mm[-1:] + (middle_mm[-1] - middle_mm[-2])
-    return np.concatenate([before, nodes_mm, behind])
+    none, row, column = np.zeros(0), line * shape.row_split + 1, column * shape.column_split
+    numbers = {"line": line, "beside": beside, "ends": both, "bends": bends, "gaps": gaps}
+    short = {name: values.astype(np.uint32, order="C") for name, values in numbers.items()}
+    return net.Net(chart=none, row=row, column=column, spacing=none, bulge=none, **short)
 
 
 def extrapolated(known: Floats | Ints, values: Floats, wanted: Floats) -> Floats:
-    """Interpolate linearly between increasing places, and extrapolate linearly beyond the ends.
-
-    Parameters
-    ----------
-    known : (n,); increasing places.
-    values : (n,); values at these places.
-    wanted : array of any shape; places to interpolate at.
-
-    Returns array of the shape of `wanted`: interpolated values.
-    """
+    """Return values (..., d) at `wanted` (...), linear between those (n, d) at increasing places, and beyond."""
     i = np.clip(np.searchsorted(known, wanted, side="right") - 1, 0, len(known) - 2)
     share = (wanted - known[i]) / (known[i + 1] - known[i])
+    share = share.reshape(share.shape + (1,) * (values.ndim - 1))
     return (1 - share) * values[i] + share * values[i + 1]
 
 
-def _spread(values: Floats, crossings: _Lattice, shape: Grid) -> Floats:
+def nearest(row: Floats, rows: int) -> Ints:
+    """Return the row of nodes nearest to each fractional row."""
+    return np.clip(np.rint(row), 0, rows - 1).astype(int)
+
+
+def _spread(values: Floats, crossings: net.Net, shape: Grid) -> Floats:
     """Return values (rows, columns) at all nodes from those at crossings (c,), bilinear, pore centers by their mean."""
     known = np.zeros((2, shape.lattice_rows, shape.lattice_columns))
     known[:, crossings.line, crossings.column // shape.column_split] = values, np.ones_like(values)
@@ -236,16 +182,4 @@ def _spread(values: Floats, crossings: _Lattice, shape: Grid) -> Floats:
     lattice = np.where(known[1] > 0, known[0], beside[0] / np.maximum(beside[1], 1.0))
     row = np.arange(shape.rows)[:, None] / shape.row_split
     column = np.arange(shape.columns)[None] / shape.column_split
-    return _bilinear(lattice[..., None], *np.broadcast_arrays(row, column))[..., 0]
-
-
-def _bilinear(grid_values: Floats, row: Floats, column: Floats) -> Floats:
-    """Return bilinear values (..., d) of a grid (n, m, d), periodic in columns, extrapolated linearly beyond rows."""
-    n, m = grid_values.shape[:2]
-    i = np.clip(np.floor(row).astype(int), 0, n - 2)
-    j = np.floor(column).astype(int)
-    down, right = (row - i)[..., None], (column - j)[..., None]
-    j, beyond = j % m, (j + 1) % m
-    above = (1 - right) * grid_values[i, j] + right * grid_values[i, beyond]
-    below = (1 - right) * grid_values[i + 1, j] + right * grid_values[i + 1, beyond]
-    return (1 - down) * above + down * below
+    return bilinear(lattice[..., None], *np.broadcast_arrays(row, column))[..., 0]

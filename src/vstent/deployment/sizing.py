@@ -19,7 +19,7 @@ from vstent.anatomy.landing_zones import landing_diameters_mm, neck_span_mm
 from vstent.deployment.braid import expected_profile, march
 from vstent.deployment.sketch import bed
 from vstent.devices.design import Design, Size
-from vstent.devices.formulas import grid, mesh_rows
+from vstent.devices.formulas import mesh_nodes
 from vstent.devices.stent import Landing, Stent
 from vstent.errors import LandingError
 from vstent.geometry.vessel import Anatomy
@@ -57,30 +57,23 @@ def oversizing_fraction(anatomy: Anatomy, stent: Stent) -> float:
 
 
 def propose_size(design: Design, anatomy: Anatomy) -> Size:
-    """Propose the size of a device for the largest aneurysm.
+    """Propose the size of a device for the largest aneurysm, narrower where the artery is too short for a wider one.
 
-    Narrower sizes are proposed where the artery is too short for a wider one.
-
-    Returns the proposed size.
-
-    Raises
-    ------
-    LandingError
-        All sizes that are not too wide for the artery are too long for it.
+    A LandingError says that all sizes that are not too wide for the artery are too long for it.
     """
     wider_mm = max(landing_diameters_mm(anatomy))
     labels = sorted({size.diameter_mm for size in design.sizes})
     zone = next((i for i, label in enumerate(labels) if label >= wider_mm - DIAMETER_SLACK_MM), len(labels) - 1)
     of_label = cache(partial(_of_label, design, anatomy))
     # No size can follow a bulge. If the next one would have gaps too, the size for the landing zone is proposed.
-    held = (size for label in labels[zone : zone + 2] if (size := of_label(label)) and _lies(design, anatomy, size))
+    apposed = (size for label in labels[zone : zone + 2] if (size := of_label(label)) and _lies(design, anatomy, size))
     fitting = (size for label in reversed(labels[: zone + 1]) if (size := of_label(label)))
-    proposed = next(chain(held, fitting), None)
+    proposed = next(chain(apposed, fitting), None)
     if proposed is not None:
         return proposed
     tried_mm = labels[: zone + 2][-1]
-    tried = [size for size in design.sizes if size.diameter_mm <= tried_mm]
-    shortest_mm = min(last - first for first, last in (_span(design, anatomy, size) for size in tried))
+    tried = [_rows_mm(design, anatomy, size) for size in design.sizes if size.diameter_mm <= tried_mm]
+    shortest_mm = min(float(rows_mm[-1]) - float(rows_mm[0]) for rows_mm in tried)
     raise LandingError(
         f"No size of {design.name} up to {tried_mm:g} mm in diameter fits: the shortest would be "
         f"{shortest_mm:.1f} mm long in a parent artery of {anatomy.parent.axis.length_mm:.1f} mm. Choose another "
@@ -89,14 +82,7 @@ def propose_size(design: Design, anatomy: Anatomy) -> Size:
 
 
 def propose_landing(design: Design, anatomy: Anatomy, size: Size) -> Landing:
-    """Propose to center the deployed device on the neck, moved only as far as the ends of the artery require.
-
-    Parameters
-    ----------
-    size : size of the device.
-
-    Returns where the middle row lies.
-    """
+    """Propose to center the deployed device on the neck, moved only as far as the ends of the artery require."""
     profile = expected_profile(design, size, anatomy)
     target_mm = float(np.mean(neck_span_mm(anatomy)))
     wanted_mm = target_mm
@@ -113,31 +99,30 @@ def propose_landing(design: Design, anatomy: Anatomy, size: Size) -> Landing:
 
 
 def reach_mm(design: Design, anatomy: Anatomy, size: Size) -> float:
-    """Return the length by which a size, landed as proposed, extends beyond the neck, in mm.
+    """Return the length by which the mesh of a size, landed as proposed, extends beyond the neck, in mm.
 
-    Parameters
-    ----------
-    size : size of the device.
-
-    Returns length on the shorter side, in mm; -inf where the size does not fit the artery.
+    It is that of the shorter side; -inf where the size does not fit the artery.
     """
-    fits = _fits(anatomy, *_span(design, anatomy, size))
-    return _margin(design, anatomy, size) if fits else -inf
+    rows_mm = _rows_mm(design, anatomy, size)
+    if rows_mm[0] <= 0 or rows_mm[-1] >= anatomy.parent.axis.length_mm:
+        return -inf
+    first_mm, last_mm = rows_mm[list(mesh_nodes(design, size))].tolist()
+    proximal_mm, distal_mm = neck_span_mm(anatomy)
+    return min(proximal_mm - first_mm, last_mm - distal_mm)
 
 
 def _of_label(design: Design, anatomy: Anatomy, label_mm: float) -> Size | None:
     """Return the shortest size of a label diameter that extends far enough, the longest that fits, or None."""
     same = sorted((size for size in design.sizes if size.diameter_mm == label_mm), key=lambda size: size.length_mm)
-    fitting = [size for size in same if _fits(anatomy, *_span(design, anatomy, size))]
-    if not fitting:
-        return None
+    reaches_mm = {size: reach_mm(design, anatomy, size) for size in same}
+    fitting = [size for size in same if reaches_mm[size] > -inf]
     wanted_mm = wanted_margin_mm(anatomy)
-    return next((size for size in fitting if _margin(design, anatomy, size) >= wanted_mm), fitting[-1])
+    return next((size for size in fitting if reaches_mm[size] >= wanted_mm), fitting[-1] if fitting else None)
 
 
 def _lies(design: Design, anatomy: Anatomy, size: Size) -> bool:
     """Return whether a size, landed as proposed, is expected to be apposed beside the neck."""
-    first_mm, last_mm = _span(design, anatomy, size)
+    first_mm, last_mm = _rows_mm(design, anatomy, size)[[0, -1]]
     proximal_mm, distal_mm = neck_span_mm(anatomy)
     found = bed(design, size, anatomy)
     along_mm = found.abscissa_mm
@@ -149,22 +134,3 @@ def _lies(design: Design, anatomy: Anatomy, size: Size) -> bool:
 def _rows_mm(design: Design, anatomy: Anatomy, size: Size) -> Floats:
     """Return the expected arc lengths (rows,) of the rows of a size, landed as proposed, in mm."""
     return march(design, size, propose_landing(design, anatomy, size), expected_profile(design, size, anatomy))
-
-
-def _span(design: Design, anatomy: Anatomy, size: Size) -> tuple[float, float]:
-    """Return the expected proximal and distal end of a size, landed as proposed, in mm."""
-    rows_mm = _rows_mm(design, anatomy, size)
-    return float(rows_mm[0]), float(rows_mm[-1])
-
-
-def _fits(anatomy: Anatomy, first_mm: float, last_mm: float) -> bool:
-    """Return whether both ends lie on the artery."""
-    return first_mm > 0 and last_mm < anatomy.parent.axis.length_mm
-
-
-def _margin(design: Design, anatomy: Anatomy, size: Size) -> float:
-    """Return the length of the mesh beyond the neck on the shorter side, in mm."""
-    rows_mm, split = _rows_mm(design, anatomy, size), grid(design, size).row_split
-    first, last = mesh_rows(design, size)
-    proximal_mm, distal_mm = neck_span_mm(anatomy)
-    return min(proximal_mm - float(rows_mm[first * split]), float(rows_mm[last * split]) - distal_mm)

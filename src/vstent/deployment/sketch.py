@@ -8,16 +8,14 @@ wall again after the crossings have moved, and it does not recompute the row pos
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final, final
+from typing import Final
 
 import numpy as np
 
 from vstent.deployment import cells, pieces
-from vstent.deployment.braid import FreeDiameter, Profile, expected_profile, landed_row, march, over_openings
+from vstent.deployment.braid import Profile, expected_profile, grown, landed_row, march, over_openings
 from vstent.deployment.contour import Planes, circles, evenly_spaced, perimeters, planes
-from vstent.deployment.crowns import shifts_mm
 from vstent.deployment.method import check_inside, check_landing
-from vstent.deployment.wall import AbstractWall, Contact
 from vstent.deployment.wires import draw
 from vstent.devices.design import Design, Size, widest_mm
 from vstent.devices.formulas import free_diameters_mm, grid
@@ -78,10 +76,7 @@ class Sketch:
 
 
 def bed(design: Design, size: Size, anatomy: Anatomy) -> Bed:
-    """Measure the wall of an artery for a device, independent of where the device is landed.
-
-    Returns contour of the device and its gap to the wall along the whole artery.
-    """
+    """Measure the wall of an artery for a device, independent of where the device is landed."""
     axis, columns = anatomy.parent.axis, grid(design, size).columns
     across = planes(axis)
     abscissa_mm = np.linspace(0.0, axis.length_mm, max(8, round(axis.length_mm / STEP_MM) + 1))
@@ -96,7 +91,7 @@ def bed(design: Design, size: Size, anatomy: Anatomy) -> Bed:
     section_mm = np.interp(abscissa_mm, axis.abscissa_mm, anatomy.parent.section_radius_mm)[:, None]
     reach_mm = np.where(reach_mm < 1.6 * section_mm, reach_mm, section_mm)
     outer = np.maximum(reach_mm - dd_mm, 0.1)[..., None] * circles(np.ones(len(abscissa_mm)), columns)
-    in_plane_mm = evenly_spaced(FreeDiameter(np.full(len(inner), widest_mm(design, size)))(inner, outer)[0])
+    in_plane_mm = evenly_spaced(grown(inner, outer, np.full(len(inner), widest_mm(design, size)))[0])
     nodes_mm = across.place(abscissa_mm, in_plane_mm).reshape(-1, 3)
     gap_mm = np.maximum(anatomy.parent.landing_surface.closest(nodes_mm)[1] - dd_mm, 0.0).reshape(-1, columns)
     band_mm = anatomy.vessel.threshold_band_mm or ASSUMED_BAND_MM
@@ -106,69 +101,33 @@ def bed(design: Design, size: Size, anatomy: Anatomy) -> Bed:
 
 
 def sketch(wall: Bed, landing: Landing) -> Sketch:
-    """Preview the device on a measured wall.
-
-    Parameters
-    ----------
-    wall : wall measured for this device and size.
-    landing : where the device is landed.
-
-    Returns the device and the uncertainty of its ends.
-
-    Raises
-    ------
-    LandingError
-        The device would extend beyond the artery.
-    """
+    """Preview the device on a wall that is measured for it; a LandingError says that it extends beyond the artery."""
     design, size = wall.design, wall.size
     check_landing(landing, float(wall.abscissa_mm[-1]))
     marched_mm = rows_mm = march(design, size, landing, wall.profile)
     check_inside(design, size, rows_mm, float(wall.abscissa_mm[-1]))
     flat = np.concatenate([wall.in_plane_mm, wall.gap_mm[..., None]], axis=2).reshape(len(wall.abscissa_mm), -1)
     laid = curves.interpolate(wall.abscissa_mm, flat, rows_mm).reshape(len(rows_mm), -1, 3)
-    if size.free_profile_mm:
-        laid = _no_wider(laid, free_diameters_mm(design, size))
+    in_plane_mm, gap_mm = laid[..., :2], laid[..., 2]
+    if size.free_profile_mm:  # rows shrink to their free diameters
+        free_mm, middle_mm = free_diameters_mm(design, size), in_plane_mm.mean(axis=1, keepdims=True)
+        share = np.minimum(np.pi * free_mm / perimeters(in_plane_mm), 1.0)[:, None, None]
+        inward_mm = (share - 1) * (in_plane_mm - middle_mm)
+        in_plane_mm, gap_mm = in_plane_mm + inward_mm, gap_mm + np.linalg.norm(inward_mm, axis=2)
     held = landed_row(design, size, landing)
     is_opening = wall.is_opening[np.abs(np.subtract.outer(rows_mm, wall.abscissa_mm)).argmin(axis=1)]
-    nodes_mm = wall.across.place(rows_mm, laid[..., :2])
+    nodes_mm = wall.across.place(rows_mm, in_plane_mm)
     slid = pieces.slide(design, size, nodes_mm, held, cells.as_drawn, is_opening)
     rows_mm = pieces.extrapolated(np.arange(len(rows_mm)), rows_mm, slid.row.mean(axis=1))
-    near = np.clip(np.rint(slid.row).astype(int), 0, len(rows_mm) - 1)
-    gap_mm = np.take_along_axis(laid[..., 2], near, axis=0) + np.linalg.norm(slid.lift_mm, axis=2)
+    near = pieces.nearest(slid.row, len(rows_mm))
+    gap_mm = np.take_along_axis(gap_mm, near, axis=0) + np.linalg.norm(slid.lift_mm, axis=2)
     nodes_mm = slid.nodes_mm + slid.lift_mm
-    wires = draw(design, size, nodes_mm, _Nothing(), slid.crowns)
-    stent = Stent(design, size, nodes_mm, rows_mm, *wires, shifts_mm(slid.crowns))
-    moved_mm = (rows_mm - marched_mm)[[0, -1]]
-    ends_mm = [_ends_mm(wall, landing, sense * wall.diameter_band_mm) + moved_mm for sense in (-1, 1)]
-    (first, last), (other_first, other_last) = (ends.tolist() for ends in ends_mm)
+    wires = draw(design, size, nodes_mm, None, slid.crowns)  # the contour already keeps the wires inside the artery
+    stent = Stent(design, size, nodes_mm, rows_mm, *wires, slid.crowns.shift_mm)
+    ends_mm = []
+    for wider_mm in (-wall.diameter_band_mm, wall.diameter_band_mm):
+        diameter_mm = np.minimum(wall.profile.diameter_mm + wider_mm, widest_mm(design, size))
+        other_mm = march(design, size, landing, replace(wall.profile, diameter_mm=diameter_mm))
+        ends_mm.append((other_mm + (rows_mm - marched_mm))[[0, -1]].tolist())
+    (first, last), (other_first, other_last) = ends_mm
     return Sketch(stent, gap_mm, (first, other_first), (last, other_last))
-
-
-def _ends_mm(wall: Bed, landing: Landing, wider_mm: float) -> Floats:
-    """Return the proximal and distal end (2,), mm along the axis, for an artery wider by `wider_mm`."""
-    diameter_mm = np.minimum(wall.profile.diameter_mm + wider_mm, widest_mm(wall.design, wall.size))
-    profile = replace(wall.profile, diameter_mm=diameter_mm)
-    return march(wall.design, wall.size, landing, profile)[[0, -1]]
-
-
-def _no_wider(laid_mm: Floats, free_mm: Floats) -> Floats:
-    """Return rows (rows, columns, 3) of plane coordinates and gaps, shrunk to their free diameters (rows,), in mm."""
-    middle_mm = laid_mm[..., :2].mean(axis=1, keepdims=True)
-    share = np.minimum(np.pi * free_mm / perimeters(laid_mm[..., :2]), 1.0)[:, None, None]
-    moved_mm = (share - 1) * (laid_mm[..., :2] - middle_mm)
-    gap_mm = laid_mm[..., 2:] + np.linalg.norm(moved_mm, axis=2, keepdims=True)
-    return np.concatenate([laid_mm[..., :2] + moved_mm, gap_mm], axis=2)
-
-
-@final
-class _Nothing(AbstractWall):
-    """Wall that is nowhere, because the contour already keeps the wires inside the artery."""
-
-    def contact(self, points_mm: Floats) -> Contact:
-        """Return an infinite distance to the wall for every point."""
-        n = len(points_mm)
-        return Contact(points_mm, np.full(n, np.inf), np.zeros((n, 3)), np.zeros(n, dtype=np.int32))
-
-    def crosses(self, starts_mm: Floats, ends_mm: Floats) -> Bools:
-        """Return False for every segment."""
-        return np.zeros(len(starts_mm), dtype=bool)

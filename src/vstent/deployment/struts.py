@@ -35,16 +35,34 @@ def struts(stent: Stent) -> Surface:
     Surface
         Solids of all wires, with outward normals. No two wires share a vertex.
     """
-    is_joined, is_last = _ring_ends(stent)
-    points_mm = stent.wire_points_mm
-    tangent = _tangents(points_mm, stent.wire_starts, is_joined)
-    outward = _outward(stent, points_mm, tangent)
-    sideways = np.cross(outward, tangent)
+    points_mm, first, last = stent.wire_points_mm, stent.wire_starts[:-1], stent.wire_starts[1:] - 1
+    is_joined = np.all(np.abs(points_mm[first] - points_mm[last]) < 1e-9, axis=1)
+    tangent = _tangents(points_mm, first, last, is_joined)
+    # Directions that follow the wall keep the sections from twisting along the wire.
+    distance, nearest = cKDTree(stent.nodes_mm.reshape(-1, 3)).query(points_mm, k=4)
+    outward = np.einsum("pk,pkd->pd", 1 / (distance + 1e-6), normals(stent.nodes_mm).reshape(-1, 3)[nearest])
+    outward = outward - np.einsum("pd,pd->p", outward, tangent)[:, None] * tangent
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     section = _sections_mm(stent)
-    vertices = points_mm[:, None] + section[..., :1] * sideways[:, None] + section[..., 1:] * outward[:, None]
+    vertices = (
+        points_mm[:, None]
+        + section[..., :1] * np.cross(outward, tangent)[:, None]
+        + section[..., 1:] * outward[:, None]
+    )
     sides = section.shape[1]
-    faces = [_side_faces(stent.wire_starts, is_joined, is_last, sides), _cap_faces(stent.wire_starts, is_joined, sides)]
-    return _compacted(vertices.reshape(-1, 3), np.concatenate(faces))
+    here, ahead = stent.piece_starts, np.arange(len(points_mm))
+    ahead[last[is_joined]] = first[is_joined]  # the last point of a ring is its first
+    ahead = ahead[here + 1]
+    side, beside = np.arange(sides), np.roll(np.arange(sides), -1)
+    a, b = here[:, None] * sides + side, here[:, None] * sides + beside
+    c, d = ahead[:, None] * sides + beside, ahead[:, None] * sides + side
+    fan = np.array([[0, i, i + 1] for i in range(1, sides - 1)])
+    caps = [first[~is_joined, None, None] * sides + fan[:, ::-1], last[~is_joined, None, None] * sides + fan]
+    parts = [np.stack([a, b, c], axis=-1), np.stack([a, c, d], axis=-1), *caps]
+    faces = np.concatenate([part.reshape(-1, 3) for part in parts]).astype(np.int32)
+    is_used = np.zeros(len(points_mm) * sides, dtype=bool)  # no face uses the last points of rings
+    is_used[faces] = True
+    return Surface(vertices.reshape(-1, 3)[is_used], (np.cumsum(is_used) - 1).astype(np.int32)[faces])
 
 
 def over_restored(stent: Stent, anatomy: Anatomy) -> Stent:
@@ -53,8 +71,6 @@ def over_restored(stent: Stent, anatomy: Anatomy) -> Stent:
     Wires on the patient's own wall have no flow across them. Near the rim of a neck, blood also passes along gaps and
     obliquely through pores, so a margin is needed. Compared with the whole device, the neck inflow of the demo with the
     screen of an Enterprise is 11 % higher with a margin of half a spacing and 1 % higher with one spacing.
-
-    Returns the stent with fewer and shorter wires.
     """
     is_over = is_over_restored(stent, anatomy, stent.wire_points_mm)
     wire = stent.point_wires
@@ -71,10 +87,7 @@ def over_restored(stent: Stent, anatomy: Anatomy) -> Stent:
 
 
 def is_over_restored(stent: Stent, anatomy: Anatomy, points_mm: Floats) -> Bools:
-    """Return whether points on a stent lie over a neck or an ostium, or within one wire spacing of it.
-
-    Shapes: `points_mm` (n, 3).
-    """
+    """Return whether points (n, 3) on a stent lie over a neck or an ostium, or within one wire spacing of it."""
     surface = anatomy.parent.landing_surface
     closing = Surface(surface.vertices_mm, surface.faces[anatomy.parent.is_restored_face])
     if not len(closing.faces):
@@ -83,41 +96,17 @@ def is_over_restored(stent: Stent, anatomy: Anatomy, points_mm: Floats) -> Bools
 
 
 def united(solid: Surface) -> Surface:
-    """Merge the struts into one solid by an exact boolean union, including where wires touch or intersect.
+    """Merge the solids of `struts` by an exact boolean union, including where wires touch or intersect.
 
-    Parameters
-    ----------
-    solid : solids of all wires, from `struts`.
-
-    Returns the merged solid.
-
-    Raises
-    ------
-    DeviceError
-        The solid is not closed, or the package manifold3d is missing.
+    A DeviceError says that the solid is not closed, or that the package manifold3d is missing.
     """
     return _surface(_union(solid))
 
 
 def blood(anatomy: Anatomy, solid: Surface) -> Surface:
-    """Compute the volume of blood: lumen, sac and branches of the patient minus the struts.
+    """Compute the boundary of the blood: lumen, sac and branches of the patient minus the solids of `struts`.
 
-    Parameters
-    ----------
-    anatomy : Anatomy
-        The artery.
-    solid : Surface
-        Solids of all wires, from `struts`.
-
-    Returns
-    -------
-    Surface
-        Boundary of the blood.
-
-    Raises
-    ------
-    DeviceError
-        The lumen or the struts are not closed, or the package manifold3d is missing.
+    A DeviceError says that lumen or struts are not closed, or that the package manifold3d is missing.
     """
     return _surface(_manifold(anatomy.vessel.closed) - _union(solid))
 
@@ -150,37 +139,16 @@ def _surface(body: Any) -> Surface:
     return Surface(np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts, dtype=np.int32))
 
 
-def _ring_ends(stent: Stent) -> tuple[Bools, Bools]:
-    """Return which wires (w,) are rings, and which points (p,) are the last of their wire."""
-    first, last = stent.wire_starts[:-1], stent.wire_starts[1:] - 1
-    is_joined = np.all(np.abs(stent.wire_points_mm[first] - stent.wire_points_mm[last]) < 1e-9, axis=1)
-    is_last = np.zeros(len(stent.wire_points_mm), dtype=bool)
-    is_last[last] = True
-    return is_joined, is_last
-
-
-def _tangents(points_mm: Floats, starts: Ints, is_joined: Bools) -> Floats:
+def _tangents(points_mm: Floats, first: Ints, last: Ints, is_joined: Bools) -> Floats:
     """Return unit tangents (p, 3) by central differences, one-sided at open ends and across the joint of a ring."""
     step = np.diff(points_mm, axis=0)
     step = step / np.linalg.norm(step, axis=1, keepdims=True).clip(1e-12)
-    first, last = starts[:-1], starts[1:] - 1
     before, after = np.zeros_like(points_mm), np.zeros_like(points_mm)
     before[1:], after[:-1] = step, step
     before[first] = np.where(is_joined[:, None], before[last], after[first])
     after[last] = np.where(is_joined[:, None], after[first], before[last])
     tangent = before + after
     return tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
-
-
-def _outward(stent: Stent, points_mm: Floats, tangent: Floats) -> Floats:
-    """Return unit directions (p, 3) out of the contour and perpendicular to the wire."""
-    # Directions that follow the wall keep the sections from twisting along the wire.
-    normal = normals(stent.nodes_mm).reshape(-1, 3)
-    distance, nearest = cKDTree(stent.nodes_mm.reshape(-1, 3)).query(points_mm, k=4)
-    weight = 1 / (distance + 1e-6)
-    outward = np.einsum("pk,pkd->pd", weight, normal[nearest])
-    outward = outward - np.einsum("pd,pd->p", outward, tangent)[:, None] * tangent
-    return outward / np.linalg.norm(outward, axis=1, keepdims=True)
 
 
 def _sections_mm(stent: Stent) -> Floats:
@@ -193,32 +161,3 @@ def _sections_mm(stent: Stent) -> Floats:
     angle = 2 * np.pi * np.arange(SIDES) / SIDES
     same_area = np.sqrt(2 * np.pi / SIDES / np.sin(2 * np.pi / SIDES))
     return 0.5 * same_area * width_mm * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-
-
-def _side_faces(starts: Ints, is_joined: Bools, is_last: Bools, sides: int) -> Ints:
-    """Return the triangles (f, 3) of the lateral faces of all wires."""
-    here = np.flatnonzero(~is_last)
-    there = here + 1
-    rings = np.flatnonzero(is_joined)
-    there[np.isin(there, starts[rings + 1] - 1)] = starts[rings]
-    a = here[:, None] * sides + np.arange(sides)
-    b = here[:, None] * sides + np.roll(np.arange(sides), -1)
-    c = there[:, None] * sides + np.roll(np.arange(sides), -1)
-    d = there[:, None] * sides + np.arange(sides)
-    return np.concatenate([np.stack([a, b, c], axis=-1), np.stack([a, c, d], axis=-1)]).reshape(-1, 3).astype(np.int32)
-
-
-def _cap_faces(starts: Ints, is_joined: Bools, sides: int) -> Ints:
-    """Return the triangles (f, 3) of the flat caps at the ends of open wires."""
-    fan = np.array([[0, i, i + 1] for i in range(1, sides - 1)])
-    first = starts[:-1][~is_joined, None, None] * sides + fan[None, :, ::-1]
-    last = (starts[1:] - 1)[~is_joined, None, None] * sides + fan[None]
-    return np.concatenate([first, last]).reshape(-1, 3).astype(np.int32)
-
-
-def _compacted(vertices_mm: Floats, faces: Ints) -> Surface:
-    """Return the surface without unused vertices: those at the last points of rings, which no face uses."""
-    is_used = np.zeros(len(vertices_mm), dtype=bool)
-    is_used[faces] = True
-    number = (np.cumsum(is_used) - 1).astype(np.int32)
-    return Surface(vertices_mm[is_used], number[faces])

@@ -2,7 +2,7 @@
 
 import difflib
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 
@@ -53,18 +53,8 @@ def user_folder() -> Path:
 def add_devices(path: Path) -> dict[str, Design]:
     """Check a device file and copy it to the user's folder, so that its devices join the catalogue.
 
-    A file of the same name that is already there is replaced.
-
-    Parameters
-    ----------
-    path : TOML file in the form of ``catalogue.toml``.
-
-    Returns added designs by their key.
-
-    Raises
-    ------
-    DeviceError
-        The file is not readable text, breaks the schema or repeats a device of the catalogue.
+    A file of the same name that is already there is replaced. The added designs are returned by their key.
+    A DeviceError is raised where it is not readable text, breaks the schema or repeats a device of the catalogue.
     """
     from vstent.devices.schema import parse
 
@@ -128,19 +118,9 @@ def find_design(name: str) -> Design:
 
 
 def find_sizes(design: Design, *, diameter_mm: float | None = None, length_mm: float | None = None) -> tuple[Size, ...]:
-    """Find all sizes of a device with a label diameter and length.
+    """Find all sizes of a device with a label diameter and length, by increasing diameter, then length.
 
-    Parameters
-    ----------
-    diameter_mm : label diameter, in mm; None matches any.
-    length_mm : label length, in mm; None matches any.
-
-    Returns sizes by increasing diameter, then length.
-
-    Raises
-    ------
-    DeviceError
-        The device is not made in this size. The message lists what is available.
+    None matches any. A DeviceError, raised where the device is not made in this size, lists what is available.
     """
     fits = [
         size for size in design.sizes if diameter_mm in (None, size.diameter_mm) and length_mm in (None, size.length_mm)
@@ -149,7 +129,8 @@ def find_sizes(design: Design, *, diameter_mm: float | None = None, length_mm: f
         return tuple(sorted(fits, key=lambda size: (size.diameter_mm, size.length_mm)))
     asked = " x ".join(f"{value:g} mm" for value in (diameter_mm, length_mm) if value is not None)
     same = [size for size in design.sizes if size.diameter_mm == diameter_mm]
-    offered = _listed(size.length_mm for size in same) if same else _listed(size.diameter_mm for size in design.sizes)
+    values = {size.length_mm for size in same} or {size.diameter_mm for size in design.sizes}
+    offered = ", ".join(f"{value:g}" for value in sorted(values))
     what = f"in {diameter_mm:g} mm its lengths are" if same else "its diameters are"
     raise DeviceError(f"{design.name} is not made in {asked}: {what} {offered} mm. Choose one of them.")
 
@@ -177,8 +158,3 @@ def find_size(design: Design, *, diameter_mm: float | None = None, length_mm: fl
         The device is not made in this size.
     """
     return find_sizes(design, diameter_mm=diameter_mm, length_mm=length_mm)[0]
-
-
-def _listed(values: Iterable[float]) -> str:
-    """Return the sorted values as text, separated by commas."""
-    return ", ".join(f"{value:g}" for value in sorted(set(values)))

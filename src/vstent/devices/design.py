@@ -7,9 +7,9 @@ D it spans one column, pi D / n, around the device. The row spacing follows from
 (pi D / n)^2).
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
-from typing import Literal
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 
@@ -20,6 +20,7 @@ Confidence = Literal["cited", "derived", "estimated"]
 """How sure a number of the catalogue is; see `Fact.confidence`."""
 STEEP_RAD = 0.1, 1.5
 """Smallest and largest angle between wire and axis at the free diameter, in rad."""
+Fraction = TypeVar("Fraction", float, np.ndarray)
 
 
 @dataclass(frozen=True)
@@ -51,11 +52,6 @@ class Range:
     """Tolerance or class from which the range follows."""
     confidence: Confidence
     """How sure the value is."""
-
-    @property
-    def is_wide(self) -> bool:
-        """Whether the range contains more than one value."""
-        return self.high > self.low
 
 
 @dataclass(frozen=True)
@@ -123,7 +119,7 @@ class Braid:
     facts: tuple[Fact, ...] = ()
     """Source and confidence of every number."""
     ranges: tuple[Range, ...] = ()
-    """Range of every number; a number of an older catalogue that states none is left out."""
+    """Range of every number."""
     strands: tuple[Strands, ...] = ()
     """Outer layer of a dual-layer device, or radiopaque strands beside the wires of the mesh."""
     has_closed_ends: bool = False
@@ -131,16 +127,40 @@ class Braid:
     kind: Literal["braid"] = field(default="braid", init=False)
     """Device family."""
 
+    follows_bends = True
+    joined_fraction = 1.0
+    joined_crowns: ClassVar[tuple[str, ...]] = ()
+    crown_gap_um = 0.0
+
     def __post_init__(self) -> None:
-        _check_columns(self.name, self.n_wires)
-        _check_angle(self.name, self.braid_angle_rad)
+        _check_lattice(self)
         for count, diameter_um in self.wires:
             if count % 2:
                 raise DeviceError(
                     f"{self.name} has {count} wires of {diameter_um:g} um, but half of the wires of each kind "
                     "run either way. Give an even number."
                 )
-        _check_strands(self)
+        for strands in self.strands:
+            if strands.count % 2 or not 2 <= strands.count <= self.n_wires:
+                raise DeviceError(
+                    f"{self.name} has {strands.count} strands {strands.place} a mesh of {self.n_wires} wires. Give an "
+                    "even number of at least 2 that is not above the number of wires."
+                )
+            if strands.place == "beside" and self.n_wires % strands.count:
+                raise DeviceError(
+                    f"{self.name} has {strands.count} strands beside wires of a mesh of {self.n_wires}. Give a number "
+                    "that divides the number of wires."
+                )
+            if strands.beyond_mm and strands.place == "beside":
+                raise DeviceError(
+                    f"{self.name} has strands beside the wires of its mesh that are longer than the mesh. Place them "
+                    "outside, or let them end with the mesh."
+                )
+        if self.has_closed_ends and len({diameter for _, diameter in self.wires}) > 1:
+            raise DeviceError(
+                f"{self.name} has closed ends but wires of several diameters, so no two of them are one wire. Give one "
+                "diameter, and thicker ones as strands."
+            )
         _check_sizes(self)
 
     @property
@@ -178,6 +198,52 @@ class Braid:
         outside = [strands.diameter_um for strands in self.strands if strands.place == "outside"]
         return self.mesh_offset_um + 2 * max(outside, default=0.0)
 
+    @property
+    def hand_um(self) -> float:
+        """Sum of the diameters of the wires of one hand, with the strands beside them, in um."""
+        beside = [(strands.count, strands.diameter_um) for strands in self.strands if strands.place == "beside"]
+        return 0.5 * sum(count * diameter for count, diameter in [*self.wires, *beside])
+
+    @property
+    def layer_um(self) -> float:
+        """Sum of the diameters of the wires of one hand of an outer layer, in um."""
+        return 0.5 * sum(one.count * one.diameter_um for one in self.strands if one.place == "outside")
+
+    def covered(self, hand: Fraction, layer: Fraction) -> Fraction:
+        """Return the fraction under metal where a hand of the mesh and one of an outer layer cover these fractions."""
+        return 1 - (1 - hand) ** 2 * (1 - layer) ** 2
+
+    @property
+    def strand_names(self) -> list[str]:
+        """Name of every group of strands, as in `Range.name`."""
+        groups = [nth("strand", k) for k in range(len(self.strands))]
+        return ["outer_layer" if one.place == "outside" else groups.pop(0) for one in self.strands]
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """Numbers of wires and strands by name, as in `Range.name`."""
+        found: dict[str, float] = {}
+        for k, (count, diameter_um) in enumerate(self.wires):
+            found |= {f"{nth('wire', k)}_count": count, f"{nth('wire', k)}_diameter_um": diameter_um}
+        found["braid_angle_rad"] = self.braid_angle_rad
+        for name, strands in zip(self.strand_names, self.strands, strict=True):
+            found |= {f"{name}_count": strands.count, f"{name}_diameter_um": strands.diameter_um}
+            found |= {f"{name}_beyond_mm": strands.beyond_mm} if strands.place == "outside" else {}
+        return found
+
+    def altered(self, values: Mapping[str, float], sizes: tuple[Size, ...]) -> "Braid":
+        """Return the braid in other sizes and with other values of its numbers, counts rounded to even ones."""
+        new = self.numbers | dict(values)
+        groups = [nth("wire", k) for k in range(len(self.wires))]
+        wires = tuple((_even(new[f"{name}_count"]), new[f"{name}_diameter_um"]) for name in groups)
+        strands = tuple(
+            Strands(
+                _even(new[f"{name}_count"]), new[f"{name}_diameter_um"], one.place, new.get(f"{name}_beyond_mm", 0.0)
+            )
+            for name, one in zip(self.strand_names, self.strands, strict=True)
+        )
+        return replace(self, wires=wires, braid_angle_rad=new["braid_angle_rad"], strands=strands, sizes=sizes)
+
 
 @dataclass(frozen=True, eq=False)
 class LaserCut:
@@ -202,7 +268,7 @@ class LaserCut:
     facts: tuple[Fact, ...] = ()
     """Source and confidence of every number."""
     ranges: tuple[Range, ...] = ()
-    """Range of every number; a number of an older catalogue that states none is left out."""
+    """Range of every number."""
     joined_crowns: tuple[str, ...] = ()
     """Which crowns between two rings are joined, for an open-cell device: one text for each row of crowns, ``1`` for a
     joined and ``0`` for a free crown. The texts are repeated around and along the device. Empty: all are joined."""
@@ -211,21 +277,27 @@ class LaserCut:
     kind: Literal["laser_cut"] = field(default="laser_cut", init=False)
     """Device family."""
 
+    follows_bends = False
+    beyond_mm = 0.0
+    layer_um = 0.0
+
     def __post_init__(self) -> None:
-        _check_columns(self.name, self.n_columns)
-        _check_angle(self.name, self.cell_angle_rad)
-        _check_crowns(self)
+        _check_lattice(self)
+        around = self.n_columns // 2
+        for text in self.joined_crowns:
+            if set(text) - set("01") or len(text) > around:
+                raise DeviceError(
+                    f"{self.name} has the pattern {text!r} of joined crowns. Give 0 and 1, at most one for each of its "
+                    f"{around} crowns around."
+                )
+            if "1" not in text:
+                raise DeviceError(f"{self.name} has a row without joined crowns, so its rings are separate. Join one.")
         _check_sizes(self)
 
     @property
     def angle_rad(self) -> float:
         """Angle between strut and axis at the free diameter, in rad."""
         return self.cell_angle_rad
-
-    @property
-    def beyond_mm(self) -> float:
-        """Length of each end of the device without a mesh, in mm: none."""
-        return 0.0
 
     @property
     def joined_fraction(self) -> float:
@@ -250,65 +322,56 @@ class LaserCut:
         """Distance from the wall to the contour, in um (dd in Zhong et al. 2016): the thickness of a strut."""
         return self.strut_thickness_um
 
+    @property
+    def hand_um(self) -> float:
+        """Sum of the widths of all struts around the device, in um."""
+        return self.n_columns * self.strut_width_um
+
+    def covered(self, struts: Fraction, layer: Fraction) -> Fraction:
+        """Return the fraction under metal: that of the struts, which meet without crossing."""
+        return struts
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """Numbers of the struts by name, as in `Range.name`."""
+        gap = ["crown_gap_um"] if self.joined_crowns else []
+        names = ["n_columns", "strut_width_um", "strut_thickness_um", "cell_angle_rad", *gap]
+        return {name: getattr(self, name) for name in names}
+
+    def altered(self, values: Mapping[str, float], sizes: tuple[Size, ...]) -> "LaserCut":
+        """Return the device in other sizes and with other values of its numbers, counts rounded to even ones."""
+        new: dict[str, Any] = {name: values.get(name, value) for name, value in self.numbers.items()}
+        return replace(self, **new | {"n_columns": _even(new["n_columns"]), "sizes": sizes})
+
 
 Design = Braid | LaserCut
 """A device of either family."""
 
 
-def _check_columns(name: str, n_columns: int) -> None:
-    """Raise a DeviceError if the number of wires or struts around the device is odd or below 6."""
-    if n_columns < 6 or n_columns % 2:
-        raise DeviceError(f"{name} has {n_columns} wires or struts around. Give an even number of at least 6.")
+def nth(name: str, number: int) -> str:
+    """Return the name of a group of wires, counted from 0: wire, wire_2 and so on."""
+    return f"{name}_{number + 1}" if number else name
 
 
-def _check_angle(name: str, angle_rad: float) -> None:
-    """Raise a DeviceError if the angle to the axis is out of range."""
-    if not STEEP_RAD[0] < angle_rad < STEEP_RAD[1]:
-        raise DeviceError(f"{name} has an angle of {angle_rad:.3f} rad to the axis. Give 0.1 to 1.5 rad.")
+def _even(count: float) -> int:
+    """Return the nearest even number."""
+    return 2 * int(np.floor(0.5 * count + 0.5))
 
 
-def _check_strands(braid: Braid) -> None:
-    """Raise a DeviceError if strands cannot be placed around the mesh, or a braid of closed ends has several wires."""
-    for strands in braid.strands:
-        if strands.count % 2 or not 2 <= strands.count <= braid.n_wires:
-            raise DeviceError(
-                f"{braid.name} has {strands.count} strands {strands.place} a mesh of {braid.n_wires} wires. Give an "
-                "even number of at least 2 that is not above the number of wires."
-            )
-        if strands.place == "beside" and braid.n_wires % strands.count:
-            raise DeviceError(
-                f"{braid.name} has {strands.count} strands beside wires of a mesh of {braid.n_wires}. Give a number "
-                "that divides the number of wires."
-            )
-        if strands.beyond_mm and strands.place == "beside":
-            raise DeviceError(
-                f"{braid.name} has strands beside the wires of its mesh that are longer than the mesh. Place them "
-                "outside, or let them end with the mesh."
-            )
-    if braid.has_closed_ends and len({diameter for _, diameter in braid.wires}) > 1:
+def _check_lattice(design: Design) -> None:
+    """Raise a DeviceError if the number of wires or struts around, or their angle to the axis, is out of range."""
+    if design.n_columns < 6 or design.n_columns % 2:
         raise DeviceError(
-            f"{braid.name} has closed ends but wires of several diameters, so no two of them are one wire. Give one "
-            "diameter, and thicker ones as strands."
+            f"{design.name} has {design.n_columns} wires or struts around. Give an even number of at least 6."
         )
-
-
-def _check_crowns(design: LaserCut) -> None:
-    """Raise a DeviceError if the pattern of joined crowns is no pattern, or leaves rings unconnected."""
-    around = design.n_columns // 2
-    for text in design.joined_crowns:
-        if set(text) - set("01") or len(text) > around:
-            raise DeviceError(
-                f"{design.name} has the pattern {text!r} of joined crowns. Give 0 and 1, at most one for each of its "
-                f"{around} crowns around."
-            )
-        if "1" not in text:
-            raise DeviceError(f"{design.name} has a row without joined crowns, so its rings are separate. Join one.")
+    if not STEEP_RAD[0] < design.angle_rad < STEEP_RAD[1]:
+        raise DeviceError(f"{design.name} has an angle of {design.angle_rad:.3f} rad to the axis. Give 0.1 to 1.5 rad.")
 
 
 def _check_sizes(design: Design) -> None:
     """Raise a DeviceError if the wires of a size have no room side by side, or it is shorter than two rows of cells."""
     for size in design.sizes:
-        taken = strips_fraction(design, size, size.free_diameter_mm)
+        taken = strips_fraction(design, size, size.free_diameter_mm, design.hand_um)
         if taken >= 1:
             raise DeviceError(
                 f"{design.name} {size.label} has no room for its wires or struts: side by side they take "
@@ -349,25 +412,17 @@ def free_sine(design: Design, size: Size) -> float:
 
 
 def angle_rad(design: Design, size: Size, diameter_mm: float | np.ndarray) -> np.ndarray:
-    """Compute the angle between wire and axis at a local diameter: sin(alpha) = sin(alpha_free) D / D_free.
+    """Compute the angle between wire and axis, in rad, at a local diameter: sin(alpha) = sin(alpha_free) D / D_free.
 
-    Parameters
-    ----------
-    diameter_mm : float or, mm; local diameter; values above the largest free diameter count as that.
-
-    Returns array of the shape of `diameter_mm`, rad: angle between wire and axis.
+    Values of `diameter_mm` above the largest free diameter count as that.
     """
     return np.arcsin(free_sine(design, size) * np.minimum(diameter_mm, widest_mm(design, size)) / size.free_diameter_mm)
 
 
-def strips_fraction(design: Design, size: Size, diameter_mm: float) -> float:
-    """Compute the fraction of the circumference that wires of one hand, or all struts, occupy side by side."""
+def strips_fraction(design: Design, size: Size, diameter_mm: float, strips_um: float) -> float:
+    """Return the fraction of the circumference that strips of this total width along the wires occupy side by side."""
     per_axis_mm = np.pi * diameter_mm * float(np.cos(angle_rad(design, size, diameter_mm)))
-    if isinstance(design, LaserCut):
-        return float(design.n_columns * design.strut_width_um * MM_PER_UM / per_axis_mm)
-    beside = [(strands.count, strands.diameter_um) for strands in design.strands if strands.place == "beside"]
-    hand_um = 0.5 * sum(count * diameter for count, diameter in [*design.wires, *beside])
-    return float(hand_um * MM_PER_UM / per_axis_mm)
+    return float(strips_um * MM_PER_UM / per_axis_mm)
 
 
 def called(designs: Iterable[Design]) -> list[str]:

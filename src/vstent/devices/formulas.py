@@ -7,9 +7,7 @@ import numpy as np
 
 from vstent.devices.design import (
     STEEP_RAD,
-    Braid,
     Design,
-    LaserCut,
     Size,
     angle_rad,
     free_sine,
@@ -95,33 +93,21 @@ def compacted(design: Design, size: Size, fraction: float) -> Size:
 
     The ends of the wires are free. When the braid is pushed, its wires wind more often around it and cross more often.
     A wire of the same length over the fraction (1 - q) of the axis has cos(alpha) = (1 - q) cos(alpha at the label
-    diameter).
-
-    Parameters
-    ----------
-    fraction : fraction q of the length.
-
-    Returns the compacted size.
-
-    Raises
-    ------
-    DeviceError
-        The wires would become too steep or too straight, or the device is not a braid.
+    diameter). A DeviceError is raised where the wires would become too steep or too straight, or cells are joined.
     """
     if fraction == 0.0:
         return size
     changed = replace(size, compaction_fraction=fraction)
-    if not (isinstance(design, Braid) and np.sin(STEEP_RAD[0]) < free_sine(design, changed) < np.sin(STEEP_RAD[1])):
-        would = "its wires would be too steep" if fraction > 0 else "its wires would be pulled straight"
-        why, then = (
-            (would, "a fraction nearer to 0")
-            if isinstance(design, Braid)
-            else ("its cells are joined", "0, or another device")
-        )
-        raise DeviceError(
-            f"{design.name} {size.label} cannot be compacted by {fraction:g} of its length, because {why}. Give {then}."
-        )
-    return changed
+    if design.kind != "braid":
+        why, then = "its cells are joined", "0, or another device"
+    elif np.sin(STEEP_RAD[0]) < free_sine(design, changed) < np.sin(STEEP_RAD[1]):
+        return changed
+    else:
+        why = "its wires would be too steep" if fraction > 0 else "its wires would be pulled straight"
+        then = "a fraction nearer to 0"
+    raise DeviceError(
+        f"{design.name} {size.label} cannot be compacted by {fraction:g} of its length, because {why}. Give {then}."
+    )
 
 
 def row_spacing_mm(
@@ -129,12 +115,7 @@ def row_spacing_mm(
 ) -> np.ndarray:
     """Compute the distance h along the axis between rows of junctions at a local diameter.
 
-    Parameters
-    ----------
-    diameter_mm : float or, mm; local diameter D; values above the largest free diameter count as that.
-    curvature_per_mm : float or, per mm; curvature of the axis.
-
-    Returns row spacing h.
+    Diameters above the largest free one count as that; `curvature_per_mm` is the curvature of the axis.
 
     Notes
     -----
@@ -195,34 +176,20 @@ def coverage_fraction(design: Design, size: Size, diameter_mm: float) -> float:
     An outer layer leaves the fraction (1 - g)^2 of the rest open, g being the same for its wires. For laser-cut struts,
     which meet without crossing, f counts all struts and is the coverage; free crowns of open cells are shorter by half
     of the gap between them.
-
-    Parameters
-    ----------
-    diameter_mm : local diameter D, in mm.
-
-    Returns metal coverage.
     """
-    strips = min(1.0, strips_fraction(design, size, diameter_mm))
-    if isinstance(design, LaserCut):
-        spacing_mm = float(row_spacing_mm(design, size, size.diameter_mm))
-        return strips * (1 - (1 - design.joined_fraction) * design.crown_gap_um * MM_PER_UM / spacing_mm)
-    per_axis_mm = np.pi * diameter_mm * float(np.cos(angle_rad(design, size, diameter_mm)))
-    outside = (one.count * one.diameter_um for one in design.strands if one.place == "outside")
-    layer = min(1.0, 0.5 * sum(outside) * MM_PER_UM / per_axis_mm)
-    return 1 - (1 - strips) ** 2 * (1 - layer) ** 2
+    hand, layer = (
+        min(1.0, strips_fraction(design, size, diameter_mm, strips_um))
+        for strips_um in (design.hand_um, design.layer_um)
+    )
+    spacing_mm = float(row_spacing_mm(design, size, size.diameter_mm))
+    shorter = (1 - design.joined_fraction) * design.crown_gap_um * MM_PER_UM / spacing_mm
+    return design.covered(hand, layer) * (1 - shorter)
 
 
 def pore_density_per_mm2(design: Design, size: Size, diameter_mm: float) -> float:
-    """Compute the number of pores per area of wall at a local diameter: 2 (n/2)^2 tan(alpha) / (pi D)^2.
+    """Compute the number of pores per mm2 of wall at a local diameter: 2 (n/2)^2 tan(alpha) / (pi D)^2.
 
     A free crown of open cells leaves two pores joined, so the number is multiplied by the fraction of joined crowns.
-
-    Parameters
-    ----------
-    diameter_mm : local diameter D, in mm.
-
-    Returns pore density, per mm2.
     """
     tangent = float(np.tan(angle_rad(design, size, diameter_mm)))
-    joined = design.joined_fraction if isinstance(design, LaserCut) else 1.0
-    return float(joined * 0.5 * design.n_columns**2 * tangent / (np.pi * diameter_mm) ** 2)
+    return float(design.joined_fraction * 0.5 * design.n_columns**2 * tangent / (np.pi * diameter_mm) ** 2)

@@ -3,6 +3,7 @@
 import csv
 import difflib
 import math
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,26 +78,12 @@ def fitted_names(design: Design) -> tuple[str, ...]:
     return tuple(name for name in numbers(design) if name.startswith(OF_MESH) or name == MARGIN)
 
 
-def direct(design: Design) -> tuple[str, ...]:
-    """Return the numbers of a device that are measured directly: counts, diameters and widths."""
-    return tuple(name for name in fitted_names(design) if name != MARGIN and not name.endswith("_angle_rad"))
-
-
 def read_measurements(path: Path, design: Design) -> tuple[Measurement, ...]:
-    """Read the measurements of a device.
+    """Read the measurements of a device of the same family, counts and widths as `design`, row after row.
 
-    Parameters
-    ----------
-    path : CSV file with a header. Every row has the columns `LABEL`, and any of the others; empty cells are left out.
-        A column ``length_error_mm`` holds the standard error of ``length_mm``, and likewise for the other quantities.
-    design : a device of the same family, with the same counts and widths.
-
-    Returns all values, row after row.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, has an unknown column, or a cell is not a positive number.
+    Every row of the CSV file has the columns `LABEL`, and any of the others; empty cells are left out. A column
+    ``length_error_mm`` holds the standard error of ``length_mm``, and likewise for the other quantities. An InputError
+    is raised where the file cannot be read, has an unknown column, or a cell is not a positive number.
     """
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -105,58 +92,43 @@ def read_measurements(path: Path, design: Design) -> tuple[Measurement, ...]:
             rows = [dict(zip(header, row.values(), strict=False)) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path} cannot be read as CSV text. Give the measurements as a CSV file.") from error
-    _check_header(path, header, design)
-    found = [one for number, row in enumerate(rows, start=2) for one in _of_row(path, number, row, design)]
-    if not found:
-        raise InputError(f"{path} has no measured value. `vstent devices fit --template` prints an example.")
-    return tuple(found)
-
-
-def _errors(design: Design) -> dict[str, float]:
-    """Return the default standard error of every column that is measured, in its unit."""
-    return OBSERVED | {name: 0.0 if name.endswith(("count", "columns")) else DIRECT_ERROR_UM for name in direct(design)}
-
-
-def _error_column(name: str) -> str:
-    """Return the column with the standard error of another column: ``length_error_mm`` for ``length_mm``."""
-    stem, _, unit = name.partition("_per_mm2") if name.endswith("_per_mm2") else name.rpartition("_")
-    return f"{stem}_error_per_mm2" if name.endswith("_per_mm2") else f"{stem}_error_{unit}"
-
-
-def _check_header(path: Path, header: list[str], design: Design) -> None:
-    """Raise an InputError if a column is missing or unknown."""
-    known = [*LABEL, TUBE, NOTE, *_errors(design), *map(_error_column, _errors(design))]
+    direct = (name for name in fitted_names(design) if name != MARGIN and not name.endswith("_angle_rad"))
+    errors = OBSERVED | {name: 0.0 if name.endswith(("count", "columns")) else DIRECT_ERROR_UM for name in direct}
+    known = [*LABEL, TUBE, NOTE, *errors, *map(_error_column, errors)]
     for name in (name for name in LABEL if name not in header):
         raise InputError(f"{path} has no column {name}. `vstent devices fit --template` prints an example.")
     for name in (name for name in header if name not in known):
         near = difflib.get_close_matches(name, known, n=1)
         hint = f"Did you mean {near[0]}?" if near else f"Columns are {', '.join(known)}."
         raise InputError(f"{path} has an unknown column {name}. {hint}")
+    found = [one for number, row in enumerate(rows, start=2) for one in _of_row(path, number, row, errors)]
+    if not found:
+        raise InputError(f"{path} has no measured value. `vstent devices fit --template` prints an example.")
+    return tuple(found)
 
 
-def _of_row(path: Path, number: int, row: Mapping[str, str | None], design: Design) -> Iterator[Measurement]:
-    """Yield the measurements of one row of the file."""
-    values = {
-        name: _number(path, number, name, cell) for name, cell in row.items() if name != NOTE and (cell or "").strip()
-    }
+def _error_column(name: str) -> str:
+    """Return the column with the standard error of another column: ``length_error_mm`` for ``length_mm``."""
+    return re.sub("(_per_mm2|_[a-z0-9]+)$", r"_error\1", name)
+
+
+def _of_row(
+    path: Path, number: int, row: Mapping[str, str | None], errors: Mapping[str, float]
+) -> Iterator[Measurement]:
+    """Yield the measurements of one row of the file; `errors` are the standard errors where it states none."""
+    where = f"{path}, row {number}"
+    values: dict[str, float] = {}
+    for name, cell in row.items():
+        if name != NOTE and (text := (cell or "").strip()):
+            try:
+                values[name] = float(text)
+            except ValueError:
+                values[name] = math.nan
+            if not (math.isfinite(values[name]) and values[name] > 0):
+                raise InputError(f"{where}: {name} is {text!r}. Give a positive number or leave it empty.")
     for name in (name for name in LABEL if values and name not in values):
-        raise InputError(f"{path}, row {number}: {name} is empty. Give the size on the box in every row.")
-    for name, usual in _errors(design).items():
-        if name in values:
-            error = values.get(_error_column(name), usual)
-            label_mm = values[LABEL[0]], values[LABEL[1]]
-            source = (row.get(NOTE) or "").strip()
-            yield Measurement(number, name, values[name], error, label_mm, values.get(TUBE), source)
-
-
-def _number(path: Path, number: int, name: str, cell: str | None) -> float:
-    """Return a cell as a positive number."""
-    try:
-        value = float(cell or "")
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0):
-        raise InputError(
-            f"{path}, row {number}: {name} is {(cell or '').strip()!r}. Give a positive number or leave it empty."
-        )
-    return value
+        raise InputError(f"{where}: {name} is empty. Give the size on the box in every row.")
+    for name in (name for name in errors if name in values):
+        error = values.get(_error_column(name), errors[name])
+        label_mm = values[LABEL[0]], values[LABEL[1]]
+        yield Measurement(number, name, values[name], error, label_mm, values.get(TUBE), (row.get(NOTE) or "").strip())

@@ -7,41 +7,32 @@ from typing import Annotated, Any, Final, Generic, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from vstent.devices.design import Braid, Confidence, Design, Fact, LaserCut, Range, Size, Strands, called
-from vstent.devices.ranges import LENGTH, MARGIN, PROFILE, nth
+from vstent.devices.design import Braid, Confidence, Design, Fact, LaserCut, Range, Size, Strands, called, nth
+from vstent.devices.ranges import LENGTH
 from vstent.devices.treatment import BARE
 from vstent.errors import DeviceError
 
-MOST_WIRES: Final = 1000
-"""Largest number of wires or columns that the schema accepts."""
-LARGEST_UM: Final = 1000.0
-"""Largest width or diameter of a wire or strut that the schema accepts, in um."""
-THINNEST_UM: Final = 5.0
-"""Smallest width or diameter of a wire or strut that the schema accepts, in um."""
 LARGEST_MM: Final = 200.0
 """Largest diameter or length of a size that the schema accepts, in mm."""
 MOST_SIZES: Final = 100
 """Largest number of diameters, or of lengths, in one block of sizes."""
-LARGEST_MARGIN_MM: Final = 1.5
-"""Largest difference between free diameter and label diameter that the schema accepts, in mm (LEO: up to 1.2)."""
-
-_Whole = Annotated[int, Field(gt=0, le=MOST_WIRES)]
-_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 def _in_um(width: float) -> float:
     """Return a width in um, or raise a ValueError if it is too small to be in um."""
-    if width < THINNEST_UM:
+    if width < 5:
         raise ValueError(f"{width:g} um is thinner than any wire or strut, give micrometres")
     return width
 
 
+_Whole = Annotated[int, Field(gt=0, le=1000)]
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _Words = Annotated[str, Field(min_length=3)]
-_Width_um = Annotated[float, Field(gt=0, le=LARGEST_UM), AfterValidator(_in_um)]
+_Width_um = Annotated[float, Field(gt=0, le=1000), AfterValidator(_in_um)]
 _Length_mm = Annotated[float, Field(ge=0, le=LARGEST_MM)]
-_Margin_mm = Annotated[float, Field(ge=-LARGEST_MARGIN_MM, le=LARGEST_MARGIN_MM)]
-Value = TypeVar("Value", int, float)
+_Margin_mm = Annotated[float, Field(ge=-1.5, le=1.5)]  # LEO: up to 1.2
 _Lengths_mm = Annotated[list[Annotated[float, Field(gt=0, le=LARGEST_MM)]], Field(min_length=1, max_length=MOST_SIZES)]
+Value = TypeVar("Value", int, float)
 
 
 class _Strict(BaseModel):
@@ -55,6 +46,10 @@ class _Sourced(_Strict):
 
     source: _Words
     confidence: Confidence
+
+    def noted(self, name: str, number: int) -> Iterator[Fact | Range]:
+        """Yield the sources and the ranges of what the field `name` holds, as the entry `number` of a list."""
+        yield Fact(name, self.source, self.confidence)
 
 
 class _Number(_Strict, Generic[Value]):
@@ -87,6 +82,11 @@ class _Stated(_Number[Value], Generic[Value]):
     confidence: Confidence
     reason: _Words
 
+    def noted(self, name: str, number: int) -> Iterator[Fact | Range]:
+        """Yield the source and the range of the number."""
+        yield Fact(name, self.source, self.confidence)
+        yield Range(name, self.value, self.low, self.high, self.reason, self.confidence)
+
 
 class _Wires(_Sourced):
     """Group of equal wires; their diameter may have a source of its own, because makers publish the count alone."""
@@ -95,23 +95,16 @@ class _Wires(_Sourced):
     count: _Number[_Whole]
     diameter_um: _Number[_Width_um]
 
-    def ranges(self, name: str) -> Iterator[Range]:
-        """Yield the ranges of the numbers of wires called `name`."""
-        for key, number in self._numbers():
-            yield _range(f"{name}_{key}", number, self)
-
-    def facts(self, name: str, number: int = 0) -> Iterator[Fact]:
-        """Yield the source of a group of `name`, counted from 0, and those of numbers that have their own."""
-        yield _fact(name, self)
-        for key, one in self._numbers():
-            if one.source is not None and one.confidence is not None:
-                yield Fact(f"{nth(name, number)}_{key}", one.source, one.confidence)
-
-    def _numbers(self) -> Iterator[tuple[str, _Number[Any]]]:
-        """Yield the numbers with the names of their fields."""
+    def noted(self, name: str, number: int) -> Iterator[Fact | Range]:
+        """Yield the source of the group, those of numbers that have their own, and the ranges of all."""
+        yield from super().noted(name, number)
         for key in type(self).model_fields:
             if isinstance(one := getattr(self, key), _Number):
-                yield key, one
+                if one.source is not None and one.confidence is not None:
+                    yield Fact(f"{nth(name, number)}_{key}", one.source, one.confidence)
+                reason, confidence = one.reason or self.reason, one.confidence or self.confidence
+                full_name = f"{nth(name.removesuffix('s'), number)}_{key}"
+                yield Range(full_name, one.value, one.low, one.high, reason, confidence)
 
 
 class _Layer(_Wires):
@@ -141,7 +134,6 @@ class _FreeProfile(_Sourced):
     wider_tolerance_mm: Annotated[float, Field(ge=0, le=5)]
     """Largest difference of these numbers to either side, in mm."""
     reason: _Words
-    """Tolerance or class from which it follows."""
     from_ends_mm: list[Annotated[float, Field(ge=0, le=LARGEST_MM)]] | None = None
     """Distances from either end that the numbers refer to, in mm, for a device with flared ends."""
     fractions: list[Annotated[float, Field(ge=0, le=1)]] | None = None
@@ -156,6 +148,11 @@ class _FreeProfile(_Sourced):
         if len(places) != len(self.wider_mm) or any(b <= a for a, b in pairwise(places)):
             raise ValueError("give as many increasing places as there are numbers in wider_mm")
         return self
+
+    def noted(self, name: str, number: int) -> Iterator[Fact | Range]:
+        """Yield the source, and the range of the difference from the numbers."""
+        yield from super().noted(name, number)
+        yield Range(name, 0.0, -self.wider_tolerance_mm, self.wider_tolerance_mm, self.reason, self.confidence)
 
     def along(self, free_mm: float, length_mm: float) -> tuple[tuple[float, float], ...]:
         """Return pairs of a fraction of the length and the free diameter there, in mm."""
@@ -174,7 +171,6 @@ class _Sizes(_Sourced):
     length_tolerance_mm: _Length_mm
     """Largest difference to either side between the label length and the length at the label diameter, in mm."""
     reason: _Words
-    """Tolerance or class from which it follows."""
 
 
 class _Device(_Strict):
@@ -189,40 +185,40 @@ class _Device(_Strict):
     free_profile: _FreeProfile | None = None
     """Flared ends, or a free diameter that tapers along the device."""
 
-    def _sizes(self) -> tuple[Size, ...]:
-        """Return all sizes of the device."""
+    def shared(self, beyond_mm: float = 0.0) -> dict[str, Any]:
+        """Return the fields that the designs of both families have.
+
+        The ends of the device that the label does not count are `beyond_mm` long.
+        """
         pairs = {(d, length) for block in self.sizes for d in block.diameters_mm for length in block.lengths_mm}
-        return tuple(self._size(diameter_mm, length_mm) for diameter_mm, length_mm in sorted(pairs))
+        sizes = []
+        for diameter_mm, length_mm in sorted(pairs):
+            free_mm = round(diameter_mm + self.free_diameter_margin_mm.value, 6)
+            along = self.free_profile.along(free_mm, length_mm + beyond_mm) if self.free_profile else ()
+            sizes.append(Size(diameter_mm, length_mm, free_mm, free_profile_mm=along))
+        noted = list(self._noted())
+        return {
+            "key": self.key,
+            "name": self.name,
+            "maker": self.maker,
+            "sizes": tuple(sizes),
+            "facts": tuple(one for one in noted if isinstance(one, Fact)),
+            "ranges": tuple(one for one in noted if isinstance(one, Range)),
+        }
 
-    def _size(self, diameter_mm: float, length_mm: float) -> Size:
-        """Return one size of the device."""
-        free_mm, whole_mm = round(diameter_mm + self.free_diameter_margin_mm.value, 6), length_mm + self._beyond_mm()
-        along = self.free_profile.along(free_mm, whole_mm) if self.free_profile else ()
-        return Size(diameter_mm, length_mm, free_mm, free_profile_mm=along)
-
-    def _beyond_mm(self) -> float:
-        """Return the length of both ends of the device that the label does not count, in mm."""
-        return 0.0
-
-    def _shared_ranges(self) -> tuple[Range, ...]:
-        """Return the ranges of the numbers that both families have; of blocks of sizes the widest."""
-        widest = sorted(self.sizes, key=lambda block: block.length_tolerance_mm)[-1]
-        found = [
-            _range(MARGIN, self.free_diameter_margin_mm),
-            _about_zero(LENGTH, widest.length_tolerance_mm, widest),
-        ]
-        if self.free_profile:
-            found.append(_about_zero(PROFILE, self.free_profile.wider_tolerance_mm, self.free_profile))
-        return tuple(found)
-
-    def _shared_facts(self) -> tuple[Fact, ...]:
-        """Return the sources of the numbers that both families have; blocks of sizes of one source have one fact."""
-        blocks = {(block.source, block.confidence): block for block in self.sizes}
-        return (
-            _fact(MARGIN, self.free_diameter_margin_mm),
-            *(_fact("sizes", block) for block in blocks.values()),
-            *([_fact("free_profile", self.free_profile)] if self.free_profile else []),
-        )
+    def _noted(self) -> Iterator[Fact | Range]:
+        """Yield the sources and the ranges of all numbers, first of those that only this family has."""
+        for name in sorted(type(self).model_fields, key=list(_Device.model_fields).__contains__):
+            entries = getattr(self, name)
+            if name == "sizes":  # blocks of one source count once, and their widest range is that of all
+                yield from dict.fromkeys(fact for block in self.sizes for fact in block.noted(name, 0))
+                widest = max(reversed(self.sizes), key=lambda block: block.length_tolerance_mm)
+                tolerance_mm = widest.length_tolerance_mm
+                yield Range(LENGTH, 0.0, -tolerance_mm, tolerance_mm, widest.reason, widest.confidence)
+            else:
+                for number, entry in enumerate(entries if isinstance(entries, list) else [entries]):
+                    if isinstance(entry, _Sourced | _Stated):
+                        yield from entry.noted(name, number)
 
 
 class _Braid(_Device):
@@ -240,52 +236,15 @@ class _Braid(_Device):
 
     def design(self) -> Design:
         """Return the braid."""
+        strands = [Strands(group.count.value, group.diameter_um.value, "beside") for group in self.strands]
+        if layer := self.outer_layer:
+            strands.append(Strands(layer.count.value, layer.diameter_um.value, "outside", layer.beyond_mm.value))
         return Braid(
-            key=self.key,
-            name=self.name,
             wires=tuple((group.count.value, group.diameter_um.value) for group in self.wires),
             braid_angle_rad=self.braid_angle_rad.value,
-            sizes=self._sizes(),
-            maker=self.maker,
-            facts=(*self._facts(), *self._shared_facts()),
-            ranges=self._ranges(),
-            strands=self._strands(),
+            strands=tuple(strands),
             has_closed_ends=self.closed_ends is not None and self.closed_ends.value,
-        )
-
-    def _beyond_mm(self) -> float:
-        """Return the length of both ends of the device that the label does not count, in mm."""
-        return 2 * self.outer_layer.beyond_mm.value if self.outer_layer else 0.0
-
-    def _facts(self) -> Iterator[Fact]:
-        """Yield the sources of the numbers that only braids have."""
-        for number, group in enumerate(self.wires):
-            yield from group.facts("wires", number)
-        yield _fact("braid_angle_rad", self.braid_angle_rad)
-        if self.outer_layer is not None:
-            yield from self.outer_layer.facts("outer_layer")
-        for number, group in enumerate(self.strands):
-            yield from group.facts("strands", number)
-        if self.closed_ends is not None:
-            yield _fact("closed_ends", self.closed_ends)
-
-    def _strands(self) -> tuple[Strands, ...]:
-        """Return the further wires of the braid."""
-        beside = tuple(Strands(group.count.value, group.diameter_um.value, "beside") for group in self.strands)
-        if self.outer_layer is None:
-            return beside
-        layer = self.outer_layer
-        return (*beside, Strands(layer.count.value, layer.diameter_um.value, "outside", layer.beyond_mm.value))
-
-    def _ranges(self) -> tuple[Range, ...]:
-        """Return the ranges of all numbers."""
-        layer = [] if self.outer_layer is None else self.outer_layer.ranges("outer_layer")
-        return (
-            *(one for number, group in enumerate(self.wires) for one in group.ranges(nth("wire", number))),
-            _range("braid_angle_rad", self.braid_angle_rad),
-            *layer,
-            *(one for number, group in enumerate(self.strands) for one in group.ranges(nth("strand", number))),
-            *self._shared_ranges(),
+            **self.shared(2 * layer.beyond_mm.value if layer else 0.0),
         )
 
 
@@ -297,10 +256,10 @@ class _LaserCut(_Device):
     strut_width_um: _Stated[_Width_um]
     strut_thickness_um: _Stated[_Width_um]
     cell_angle_rad: _Stated[_Positive]
-    joined_crowns: _Crowns | None = None
-    """Which crowns are joined, for a device with open cells."""
     crown_gap_um: _Stated[_Width_um] | None = None
     """Distance between free crowns that face each other, in um."""
+    joined_crowns: _Crowns | None = None
+    """Which crowns are joined, for a device with open cells."""
 
     @model_validator(mode="after")
     def _check(self) -> "_LaserCut":
@@ -311,25 +270,14 @@ class _LaserCut(_Device):
 
     def design(self) -> Design:
         """Return the laser-cut device."""
-        names = ["n_columns", "strut_width_um", "strut_thickness_um", "cell_angle_rad"]
-        numbers = names + (["crown_gap_um"] if self.crown_gap_um else [])
-        words = numbers + (["joined_crowns"] if self.joined_crowns else [])
         return LaserCut(
-            key=self.key,
-            name=self.name,
             n_columns=self.n_columns.value,
             strut_width_um=self.strut_width_um.value,
             strut_thickness_um=self.strut_thickness_um.value,
             cell_angle_rad=self.cell_angle_rad.value,
-            sizes=self._sizes(),
-            maker=self.maker,
-            facts=tuple(_fact(name, getattr(self, name)) for name in words) + self._shared_facts(),
-            ranges=(
-                *(_range(name, getattr(self, name)) for name in numbers),
-                *self._shared_ranges(),
-            ),
             joined_crowns=tuple(self.joined_crowns.value) if self.joined_crowns else (),
             crown_gap_um=self.crown_gap_um.value if self.crown_gap_um else 0.0,
+            **self.shared(),
         )
 
 
@@ -339,40 +287,10 @@ class _Catalogue(_Strict):
     device: list[Annotated[_Braid | _LaserCut, Field(discriminator="kind")]]
 
 
-def _fact(name: str, sourced: _Sourced | _Stated[int] | _Stated[float]) -> Fact:
-    """Return the source of one number."""
-    return Fact(name, sourced.source, sourced.confidence)
-
-
-def _range(name: str, number: _Number[int] | _Number[float], group: _Wires | None = None) -> Range:
-    """Return the range of a number, with its own reason and confidence or those of its group."""
-    reason, confidence = number.reason, number.confidence
-    if group is not None:
-        reason, confidence = reason or group.reason, confidence or group.confidence
-    assert reason is not None
-    assert confidence is not None
-    return Range(name, number.value, number.low, number.high, reason, confidence)
-
-
-def _about_zero(name: str, tolerance: float, group: _Sizes | _FreeProfile) -> Range:
-    """Return the range of a difference from values of the catalogue."""
-    return Range(name, 0.0, -tolerance, tolerance, group.reason, group.confidence)
-
-
 def parse(text: str, name: str = "The device catalogue") -> dict[str, Design]:
-    """Read a catalogue from TOML text.
+    """Read a catalogue from TOML text, and return its designs by their key; `name` is its name in messages.
 
-    Parameters
-    ----------
-    text : content of the file.
-    name : name of the catalogue in messages.
-
-    Returns designs by their key.
-
-    Raises
-    ------
-    DeviceError
-        The text is not TOML, breaks the schema or lists a device twice.
+    A DeviceError is raised if the text is not TOML, breaks the schema or lists a device twice.
     """
     try:
         found = _Catalogue.model_validate(tomllib.loads(text)).device

@@ -150,15 +150,9 @@ class Deployment:
 
 
 def row_diameters_mm(nodes_mm: Floats) -> Floats:
-    """Compute the diameters of circles with the perimeters of the rows, seen along the device.
+    """Compute the diameters (rows,) of circles with the perimeters of the rows (rows, columns, 3), in mm.
 
     The perimeters are projected along the device because rows may be tilted.
-
-    Parameters
-    ----------
-    nodes_mm : (rows, columns, 3), mm; nodes of the contour.
-
-    Returns (rows,), mm: diameters.
     """
     around_mm = np.roll(nodes_mm, -1, axis=1) - nodes_mm
     columns = nodes_mm.shape[1]
@@ -175,20 +169,12 @@ def row_diameters_mm(nodes_mm: Floats) -> Floats:
 
 
 def tube_faces(rows: int, columns: int) -> Ints:
-    """Build the triangles of a tube of rings of vertices.
+    """Build the triangles (2 (rows - 1) columns, 3) of a tube of rings of vertices.
 
-    Parameters
-    ----------
-    rows : number of rings.
-    columns : number of vertices in a ring.
-
-    Returns (2 (rows - 1) columns, 3): triangles. They face outward if each ring runs counter-clockwise about the
-    direction of increasing rows.
+    They face outward if each ring runs counter-clockwise about the direction of increasing rows.
     """
     row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns), indexing="ij")
     a = row * columns + column
     b = row * columns + (column + 1) % columns
     c, d = a + columns, b + columns
-    first = np.stack([a, b, d], axis=-1).reshape(-1, 3)
-    second = np.stack([a, d, c], axis=-1).reshape(-1, 3)
-    return np.concatenate([first, second]).astype(np.int32)
+    return np.stack([[a, b, d], [a, d, c]]).transpose(0, 2, 3, 1).reshape(-1, 3).astype(np.int32)

@@ -121,14 +121,9 @@ def with_device(
 ) -> Treatment:
     """Return the treatment with one device in the parent artery; missing values are proposed.
 
-    Parameters
-    ----------
-    device : key of the design in the catalogue; also the name of the treatment and of its implant.
-    diameter_mm, length_mm : label diameter and length in mm.
-    center_mm : position of the device's middle along the parent artery, in mm.
+    The treatment and its implant have the name of the device; `center_mm` is the position of its middle.
     """
-    placing = Placing(position_mm=center_mm)
-    return Treatment(device, (Implant(device, device, diameter_mm, length_mm, placing),))
+    return Treatment(device, (Implant(device, device, diameter_mm, length_mm, Placing(position_mm=center_mm)),))
 
 
 def read_treatment(text: str) -> Treatment:

@@ -16,7 +16,7 @@ import numpy as np
 from vstent.anatomy.morphology import Measures
 from vstent.deployment.deploy import APPOSED_GAP_MM, propose_size
 from vstent.devices.design import Design, LaserCut, Range, Size
-from vstent.devices.ranges import altered, altered_sizes, uncertain, values_at
+from vstent.devices.ranges import altered, altered_size, uncertain, values_at
 from vstent.devices.stent import Deployment
 from vstent.errors import DeviceError, LandingError
 from vstent.geometry.vessel import Anatomy
@@ -188,6 +188,6 @@ def _band(points: Floats, values: Floats, value: float, ranges: tuple[Range, ...
 def _proposed(design: Design, anatomy: Anatomy, values: Mapping[str, float]) -> Size | None:
     """Return the size of the catalogue that is proposed for a device with other numbers; None where none fits."""
     with suppress(DeviceError, LandingError):
-        other, original = altered_sizes(design, values)
-        return original[propose_size(other, anatomy)]
+        original = {altered_size(size, values): size for size in design.sizes}
+        return original[propose_size(design.altered(values, tuple(original)), anatomy)]
     return None
