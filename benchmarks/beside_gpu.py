@@ -78,7 +78,7 @@ def table(anatomy: Anatomy, spacing_mm: float) -> None:
     field = timed("wall shear stress and result", lambda: result_of(state))
     with TemporaryDirectory() as folder:
         store = Store(Path(folder))
-        timed("storing a flow", lambda: store.keep("flow silk", Key("0", "0"), field))
+        timed("storing a flow", lambda: store.save("flow silk", Key("0", "0"), field))
         timed("writing a flow", lambda: write_field(Path(folder), field))
     timed("indices and grade", lambda: grade(case, field, indices(field, case.sac, case.ostium)))
 

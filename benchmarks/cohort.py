@@ -25,7 +25,7 @@ from vstent.cohort.cases import Case, find_cases
 from vstent.cohort.work import COST, Row
 from vstent.io.writers import write_stl
 from vstent.phantoms import Phantom
-from vstent.study.crews import DaskCluster
+from vstent.study.workers import DaskCluster
 
 SEED = 7
 EDGE_MM = 0.3

@@ -15,7 +15,7 @@ from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_stl
 from vstent.kernels.first_use import kept
 from vstent.plan.workers import spread
-from vstent.study.crews import Processes
+from vstent.study.workers import Processes
 
 SOURCES = Path(warm.__file__).parents[3]
 NAMES = ("random", "pickle", "struct", "multiprocessing", "numpy", "secrets", "runpy", "logging", "vstent")

@@ -15,7 +15,7 @@ from vstent import cli, phantoms
 from vstent.flow import simulation
 from vstent.io.writers import write_stl
 from vstent.study import demo
-from vstent.study.stages import measure_all
+from vstent.study.stages import measure_study
 
 HERE = Path(__file__).parents[1]
 TEXTS = [HERE / "README.md", HERE / "CONTRIBUTING.md"]
@@ -77,7 +77,8 @@ def test_readme_says_the_number_of_a_run(
     deployed = studied.metrics["treatments"]["silk"]["implants"]["silk"]
     assert deployed == {"bands": deployed["bands"]} | vstent.measure(anatomy, silk)
     flows = {"bare": names["before"], "silk": names["after"]}
-    measured = measure_all(studied.anatomy, studied.implants, flows, COARSE)["treatments"]
+    settings = vstent.Settings(treatments=(), flow=COARSE)
+    measured = measure_study(studied.anatomy, studied.implants, flows, settings, {}, {})["treatments"]
     bare, stented = (measured[name] for name in flows)
     assert {key: one.before for key, one in change.items()}.items() <= bare["flow"].items()
     assert bare["flow"].keys() - change.keys() == {"unsettled_fraction"}

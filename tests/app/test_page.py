@@ -38,9 +38,9 @@ from vstent.io.images import read_image
 from vstent.io.writers import write_stl
 from vstent.plan.ranges import Ranges
 from vstent.study import store as stored
-from vstent.study.flow_store import FlowStore
 from vstent.study.folder import CACHE
 from vstent.study.keys import hash_of, study_keys
+from vstent.study.ranking_flows import FlowStore
 from vstent.study.repeat import settings_of
 from vstent.study.settings import InputSettings, Settings
 
@@ -533,7 +533,7 @@ def test_a_folder_of_vstent_run_opens_with_all_that_it_holds(study, tmp_path):
 def keep_flow(folder, source, settings, name):
     """Keep a flow as a study of these settings does."""
     key = study_keys(source, settings)[f"flow {name}"]
-    stored.Store(folder / CACHE).keep(f"flow {name}", key, report_case.field(1.0))
+    stored.Store(folder / CACHE).save(f"flow {name}", key, report_case.field(1.0))
 
 
 @pytest.fixture

@@ -31,9 +31,9 @@ from vstent.flow.settings import FlowSettings
 from vstent.io.tables import write_parquet, write_rows
 from vstent.io.writers import write_stl
 from vstent.reporting.cohort import cohort_report, modified_z_scores
-from vstent.study.crews import DaskCluster, Processes, Slurm
 from vstent.study.pipeline import run as run_study
 from vstent.study.settings import AnatomySettings, InputSettings, settings_of
+from vstent.study.workers import DaskCluster, Processes, Slurm
 
 TREATMENTS = (with_device("silk"), with_device("enterprise", center_mm=27.0))
 """The Enterprise within an artery of 44 mm, beyond the end of one of 11 mm that is continued to 31.5 mm."""
@@ -346,7 +346,7 @@ def test_a_dask_worker_killed_midway_gives_the_same_table_and_a_lost_scheduler_k
 
 @needs_dask
 def test_no_scheduler_is_told_in_a_sentence(scans, tmp_path, monkeypatch):
-    monkeypatch.setattr("vstent.study.crews.SCHEDULER_S", 0.5)
+    monkeypatch.setattr("vstent.study.workers.SCHEDULER_S", 0.5)
     with pytest.raises(InputError, match="No Dask scheduler answers"):
         list(DaskCluster("tcp://127.0.0.1:9").do(work, left_to_do(find_cases(scans, GIVEN), tmp_path)))
 

@@ -22,7 +22,7 @@ from vstent.io.writers import write_stl
 from vstent.plan import rank_flow
 from vstent.plan.rank import Ranking, rank
 from vstent.plan.rank_flow import chosen_of, rank_flows
-from vstent.study.flow_store import FlowStore
+from vstent.study.ranking_flows import FlowStore
 from vstent.study.store import Key
 
 ARTERY = Key("anatomy", "code")

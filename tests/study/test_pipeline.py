@@ -364,7 +364,7 @@ def test_on_a_gpu_a_flow_is_stored_while_the_next_is_computed(tmp_path: Path, mo
             is_next_begun.set()
         return SimpleNamespace(name=case, start=start, advice="")
 
-    def write(store: Store, name: str, key: Key, result: object, seconds: dict[str, float]) -> None:
+    def write(store: Store, name: str, key: Key, seconds: dict[str, float]) -> None:
         assert is_next_begun.wait(20.0)
         threads.add(get_ident())
         stored.append((name, list(seconds)))
@@ -373,11 +373,12 @@ def test_on_a_gpu_a_flow_is_stored_while_the_next_is_computed(tmp_path: Path, mo
         stored.append(folder.relative_to(tmp_path).as_posix())
 
     monkeypatch.setattr("numba.threading_layer", lambda: "omp")
-    monkeypatch.setattr(stages, "_plan", lambda *_: None)
+    monkeypatch.setattr(stages, "plan_flows", lambda *_: None)
     monkeypatch.setattr(stages, "flow_case", lambda anatomy, implants, flow: implants[0].name if implants else "bare")
     monkeypatch.setattr(stages, "simulate_case", computed)
     monkeypatch.setattr(stages, "write_field", written)
-    monkeypatch.setattr(Store, "_keep", write)
+    monkeypatch.setattr("vstent.io.archive.save_data", lambda *_: None)
+    monkeypatch.setattr(Store, "write", write)
     silk = {"silk": SimpleNamespace(stent=SimpleNamespace(name="silk"))}
     store, keys = Store(tmp_path / "cache"), study_keys("", settings)
     fields, failures = stages.compute_flows(tmp_path, None, {"silk": silk}, settings, store, keys)

@@ -166,7 +166,7 @@ class Job:
         self.case.update(anatomy=key, done=state.done | {step: keys[step] for step in steps}, failed=failed)
 
     def _take(self, now: dict[str, Any]) -> None:
-        """Record the progress of a stage (`vstent.study.types.Progress`) and notify the clients."""
+        """Record the progress of a stage (`vstent.study.progress.Progress`) and notify the clients."""
         if now["stage"] != self.now["stage"]:
             self.residuals.clear()
         self.now = now

@@ -301,7 +301,7 @@ class _Store:
         """Return the live flow of a case, continued from the stored one where there is one."""
         from vstent.flow.lattice.live import BareFlow, LiveFlow
 
-        stored = None if self.shelf is None else Store(self.shelf.folder).peek(STORED, self.shelf.key, BareFlow)
+        stored = None if self.shelf is None else Store(self.shelf.folder).load(STORED, self.shelf.key, BareFlow)
         if stored is not None:
             with suppress(*DAMAGE):
                 live = LiveFlow(case, stored=stored)
@@ -314,7 +314,7 @@ class _Store:
         if not self._is_current and self.shelf is not None:
             self._is_current = True
             with suppress(OSError):
-                Store(self.shelf.folder).keep(STORED, self.shelf.key, live.stored())
+                Store(self.shelf.folder).save(STORED, self.shelf.key, live.stored())
 
 
 class _Worker:

@@ -12,10 +12,10 @@ from vstent.io.writers import write_json
 from vstent.plan.rank import Ranking, rank
 from vstent.plan.rank_flow import rank_flows
 from vstent.reporting.definitions import DEFINITIONS
-from vstent.study.flow_store import FlowStore
 from vstent.study.folder import CACHE
 from vstent.study.keys import ANATOMY, anatomy_keys
 from vstent.study.progress import OnProgress, Progress
+from vstent.study.ranking_flows import FlowStore
 from vstent.study.stages import find_anatomy
 from vstent.study.store import Key, Store
 

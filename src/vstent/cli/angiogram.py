@@ -76,7 +76,7 @@ def _angiogram(arguments: argparse.Namespace) -> int:
     from vstent.cli.console import Console, angiogram_table
     from vstent.reporting.film_case import film_case, write_report_again
     from vstent.study.contrast import FOLDER
-    from vstent.study.provenance import METRICS
+    from vstent.study.folder import METRICS
 
     film, study = given_film(arguments), given_study(arguments)
     settings, console = given_angiogram(arguments), Console()

@@ -26,7 +26,7 @@ def add(commands: options.Commands) -> None:
     )
     options.add_settings(parser, *options.VESSEL, *options.STUDY)
     working = parser.add_argument_group("parallel work")
-    options.add_crew(working)
+    options.add_workers(working)
     working.add_argument(
         "--keep-files", action="store_true", help="keep all files of every case (default: the table only)"
     )
@@ -47,7 +47,7 @@ def _batch(arguments: argparse.Namespace) -> int:
     console.print(f"{len(cases)} cases, {row_count(cases)} rows; {len(tasks)} cases to do: {foreseen.sentence}.")
     with console.live():
         run_cohort(
-            tasks, arguments.out, options.given_crew(arguments, foreseen.jobs, foreseen.memory_MB), _teller(console)
+            tasks, arguments.out, options.given_workers(arguments, foreseen.jobs, foreseen.memory_MB), _teller(console)
         )
     rows = collect(cases, arguments.out)
     written = write_table(arguments.out, rows)

@@ -12,7 +12,7 @@ from vstent.errors import InputError
 from vstent.study.settings import OPTIONS, Settings, in_section, settings_of
 
 if TYPE_CHECKING:
-    from vstent.study.crews import AbstractCrew
+    from vstent.study.workers import AbstractWorkers
 
 EPILOG: Final = "Lengths are in mm, coordinates are LPS. Research use only: not cleared for diagnosis or treatment."
 """Last line of every help text."""
@@ -122,16 +122,18 @@ def add_case(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_crew(group: "argparse._ArgumentGroup") -> None:
+def add_workers(group: "argparse._ArgumentGroup") -> None:
     """Add the number of parallel processes, and the clusters that may be used in their place."""
     jobs = fields.Option("jobs", "parallel processes", fields.whole, fields.Limits(low=1), "one per core", "N")
     add_option(group, jobs, default=cores())
-    crew = group.add_mutually_exclusive_group()
-    crew.add_argument("--scheduler", metavar="ADDRESS", help="use the workers of this Dask scheduler")
-    crew.add_argument("--slurm", action="store_true", help="use --jobs jobs of a Slurm queue (needs the extra cluster)")
+    workers = group.add_mutually_exclusive_group()
+    workers.add_argument("--scheduler", metavar="ADDRESS", help="use the workers of this Dask scheduler")
+    workers.add_argument(
+        "--slurm", action="store_true", help="use --jobs jobs of a Slurm queue (needs the extra cluster)"
+    )
 
 
-def given_crew(arguments: argparse.Namespace, jobs: int, memory_MB: float) -> "AbstractCrew":
+def given_workers(arguments: argparse.Namespace, jobs: int, memory_MB: float) -> "AbstractWorkers":
     """Return the processes or the cluster that the options request.
 
     Raises
@@ -139,7 +141,7 @@ def given_crew(arguments: argparse.Namespace, jobs: int, memory_MB: float) -> "A
     InputError
         A Slurm job is requested whose memory is unknown.
     """
-    from vstent.study.crews import DaskCluster, Processes, Slurm
+    from vstent.study.workers import DaskCluster, Processes, Slurm
 
     if arguments.scheduler:
         return DaskCluster(arguments.scheduler)

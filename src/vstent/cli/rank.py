@@ -39,7 +39,7 @@ def add(commands: options.Commands) -> None:
         action="store_true",
         help="carry contrast through these flows too; the time that it stays in the sac counts in their scores",
     )
-    options.add_crew(ranking)
+    options.add_workers(ranking)
     parser.set_defaults(command=_rank)
 
 
@@ -90,10 +90,9 @@ def _with_flows(
     from vstent.flow.settings import FlowSettings
     from vstent.flow.simulation import check_engine
     from vstent.plan.rank_flow import chosen_of, rank_flows
-    from vstent.study.flow_crew import compute_missing, parallel_flows
-    from vstent.study.flow_store import FlowStore
     from vstent.study.keys import ANATOMY, anatomy_keys, hash_of
     from vstent.study.progress import Progress
+    from vstent.study.ranking_flows import FlowStore, compute_missing, parallel_flows
 
     def told(done: int, total: int, name: str) -> None:
         console.progress(Progress("rank by flow", done / total, f"{done} of {total}: {name}"))
@@ -107,9 +106,11 @@ def _with_flows(
     is_cluster = bool(arguments.scheduler or arguments.slurm)
     is_parallel = bool(anatomy.aneurysms and chosen) and (jobs > 1 or is_cluster)
     if is_parallel:
-        crew = options.given_crew(arguments, jobs, memory_MB)
+        workers = options.given_workers(arguments, jobs, memory_MB)
         threads = 1 if is_cluster else max(1, options.cores() // jobs)
-        compute_missing(anatomy, chosen, flow, stored, crew, has_contrast=has_contrast, threads=threads, progress=told)
+        compute_missing(
+            anatomy, chosen, flow, stored, workers, has_contrast=has_contrast, threads=threads, progress=told
+        )
     return rank_flows(
         anatomy,
         ranking,

@@ -13,9 +13,9 @@ from vstent.errors import InputError
 if TYPE_CHECKING:
     from vstent.angiography.angiogram import AngiogramSettings
     from vstent.cli.console import Console
+    from vstent.study.pipeline import CaseResult
     from vstent.study.progress import OnProgress
     from vstent.study.settings import Settings
-    from vstent.study.types import CaseResult
 
 
 def add(commands: options.Commands) -> None:

@@ -13,7 +13,7 @@ from typing import Final, Protocol
 from vstent.cohort.cases import Case
 from vstent.cohort.work import LOST, Row, Task, picture_path, read_row, work, write_row
 from vstent.io.tables import write_parquet, write_rows
-from vstent.study.crews import AbstractCrew
+from vstent.study.workers import AbstractWorkers
 
 CASES: Final = "cases"
 """Subfolder of the output folder that holds one folder per case."""
@@ -47,14 +47,14 @@ def left_to_do(cases: Sequence[Case], out: Path, *, keeps_files: bool = False) -
     return tasks
 
 
-def run_cohort(tasks: Sequence[Task], out: Path, crew: AbstractCrew, progress: Progress) -> None:
+def run_cohort(tasks: Sequence[Task], out: Path, workers: AbstractWorkers, progress: Progress) -> None:
     """Run tasks in parallel; a case whose process died gets rows that state it.
 
     Parameters
     ----------
     tasks : tasks from `left_to_do`.
     out : output folder of the cohort.
-    crew : processes or cluster that runs the tasks.
+    workers : processes or cluster that runs the tasks.
     progress : called when a case has ended.
 
     Raises
@@ -64,7 +64,7 @@ def run_cohort(tasks: Sequence[Task], out: Path, crew: AbstractCrew, progress: P
     VstentError
         The connection to the cluster is lost; finished rows are kept.
     """
-    for done, ended in enumerate(crew.do(work, tasks), start=1):
+    for done, ended in enumerate(workers.do(work, tasks), start=1):
         task = tasks[ended.number]
         for treatment, key in task.keys.items():
             if read_row(task.folder, treatment, key) is None:

@@ -15,10 +15,10 @@ from vstent.errors import VstentError
 from vstent.io.files import atomic
 from vstent.io.writers import write_json, write_text
 from vstent.reporting.figures import patient_picture
-from vstent.study.crews import alone
 from vstent.study.pipeline import restore_vessel, run
 from vstent.study.progress import OnProgress, Progress
 from vstent.study.settings import Settings
+from vstent.study.workers import alone
 from vstent.units import BYTES_PER_MB
 
 Row = dict[str, Any]

@@ -12,7 +12,7 @@ from vstent.reporting.method import method_plates
 from vstent.reporting.scene import Scene, scene_of
 
 if TYPE_CHECKING:
-    from vstent.study.types import Computed
+    from vstent.study.pipeline import Computed
 
 Item = TypeVar("Item")
 Found = TypeVar("Found")

@@ -11,8 +11,7 @@ from vstent.devices.catalogue import find_design
 from vstent.devices.treatment import BARE
 from vstent.reporting.films import Density, shown_of, write_films
 from vstent.reporting.write import write_report
-from vstent.study.contrast import FOLDER, angiograms
-from vstent.study.films import Recording, stents_of
+from vstent.study.contrast import FOLDER, angiograms, stents_of
 from vstent.study.folder import RUN, claimed
 from vstent.study.pipeline import run
 from vstent.study.progress import OnProgress, Progress
@@ -47,15 +46,14 @@ def film_case(
     FlowError
         A flow does not fit in the free memory.
     """
-    recording = Recording(replace(settings, frames_per_s=max(settings.frames_per_s, film.frame_rate_Hz)))
-    found = angiograms(out, recording.settings, progress, record=recording)
+    settings = replace(settings, frames_per_s=max(settings.frames_per_s, film.frame_rate_Hz))
+    found, histories = angiograms(out, settings, progress)
     progress(Progress("film", 0.0))
     anatomy, stents = stents_of(out, found if film.has_wires else ())
     treatments = finished_run(out)[1].treatments
     titles = {BARE: "Before"} | {
         one.name: " + ".join(find_design(key).name for key in one.devices) for one in treatments
     }
-    histories = {name: recording.histories[name] for name in found}
     shown = shown_of(histories, stents, titles, aimed(film, anatomy))
     curves = {titles[name]: one.curves for name, one in found.items()}
     densities = [Density(title, one.time_s, one.sac_mg_mL, one.parent_mg_mL) for title, one in curves.items()]

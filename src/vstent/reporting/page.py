@@ -34,7 +34,7 @@ from vstent.reporting.scene import Scene, implant_titles
 from vstent.reporting.uncertainty import Varied, uncertainty_of
 
 if TYPE_CHECKING:
-    from vstent.study.types import CaseResult
+    from vstent.study.pipeline import CaseResult
 
 OF_CONTOUR: Final = (
     "The contour is the active contour of Zhong et al. 2016 with a rigid wall: forces between artery and "

@@ -9,7 +9,7 @@ from vstent.reporting.paper import ACCENT, QUIET, Paper
 from vstent.reporting.quantities import Change, Quantity
 
 if TYPE_CHECKING:
-    from vstent.study.types import CaseResult
+    from vstent.study.pipeline import CaseResult
 
 
 def report_pdf(case: "CaseResult") -> bytes:

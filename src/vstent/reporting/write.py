@@ -17,7 +17,7 @@ from vstent.study.repeat import SECONDS
 from vstent.study.store import Store
 
 if TYPE_CHECKING:
-    from vstent.study.types import CaseResult
+    from vstent.study.pipeline import CaseResult
 
 ASSETS: Final = Path(__file__).with_name("assets")
 """Folder of the report's templates, styles and scripts."""

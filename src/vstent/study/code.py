@@ -31,14 +31,10 @@ _OF_OPTIONS: Final = "vstent.fields"
 
 @cache
 def code_of(entry: str, without: tuple[str, ...] = ()) -> str:
-    """Return the digest of the code that a module or a function needs.
+    """Return the digest of the code that a module, or a function (``module:function``), needs.
 
-    Imports inside functions count, imports for types only do not.
-
-    Parameters
-    ----------
-    entry : a module, or ``module:function``.
-    without : prefixes of modules that do not count, because the result does not use them.
+    Imports inside functions count, imports for types only do not. Modules that begin with a prefix of `without` do not
+    count either, because the result does not use them.
     """
     todo, found, memory = [entry], dict[str, str](), _memory()
     is_new = False
@@ -88,10 +84,7 @@ def _read(file: Path, function: str) -> tuple[str, list[str]]:
                 setattr(node, name, [one for one in value if not _is_silent(one)])
     statements = _used(tree.body, function) if function else tree.body
     imports = {name for one in statements for node in ast.walk(one) for name in _imports(node)}
-    parts: list[str] = []
-    for one in statements:
-        _describe(one, parts)
-    return digest(parts), sorted(imports)
+    return digest(str([_described(one) for one in statements])), sorted(imports)
 
 
 def _is_silent(node: object) -> bool:
@@ -101,21 +94,12 @@ def _is_silent(node: object) -> bool:
     return isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
 
 
-def _describe(value: object, parts: list[str]) -> None:
-    """Append the description of a syntax tree without positions, the same in every version of Python."""
+def _described(value: object) -> Any:
+    """Return a syntax tree without positions as nested lists, the same in every version of Python."""
     if isinstance(value, ast.AST):
-        parts.append(type(value).__name__)
-        for name in value._fields:
-            item = getattr(value, name, None)
-            if item is not None and item != []:
-                parts.append(name)
-                _describe(item, parts)
-    elif isinstance(value, list):
-        parts.append(str(len(value)))
-        for item in value:
-            _describe(item, parts)
-    else:
-        parts.append(repr(value))
+        parts = ((name, getattr(value, name, None)) for name in value._fields)
+        return [type(value).__name__, *([name, _described(part)] for name, part in parts if part not in (None, []))]
+    return [_described(item) for item in value] if isinstance(value, list) else repr(value)
 
 
 def _used(statements: list[ast.stmt], function: str) -> list[ast.stmt]:

@@ -2,14 +2,15 @@
 
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict
-from functools import cache
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
-from vstent.angiography.angiogram import Angiogram, AngiogramSettings, Watch, angiogram
+from vstent.angiography.angiogram import Angiogram, AngiogramSettings, angiogram, entering
+from vstent.angiography.history import History, Recorder
+from vstent.devices.stent import Stent
 from vstent.devices.treatment import BARE
 from vstent.errors import InputError
 from vstent.flow.case import FlowField
@@ -17,12 +18,11 @@ from vstent.flow.indices import ratios
 from vstent.geometry.vessel import Anatomy
 from vstent.io.tables import write_rows
 from vstent.io.writers import write_json
-from vstent.study.folder import CACHE, claimed
+from vstent.study.folder import CACHE, METRICS, claimed
 from vstent.study.keys import angiogram_key, study_keys
 from vstent.study.progress import OnProgress
-from vstent.study.provenance import METRICS
 from vstent.study.repeat import finished_run
-from vstent.study.stages import finished_anatomy
+from vstent.study.stages import deploy_all, finished_anatomy
 from vstent.study.store import UNREADABLE, Key, Store
 
 FOLDER: Final = "angiogram"
@@ -32,26 +32,13 @@ CURVES: Final = "curves.csv"
 NUMBERS: Final = "angiogram.json"
 """File with settings, measures and advice of all flows."""
 
-Record = Callable[[str, Key, Store, Callable[[], FlowField | None]], AbstractContextManager[Watch | None]]
-"""Takes the name of a flow, its key, the store, and what reads the flow (None where there is none); its context yields
-what watches the frames, or None."""
-
 
 def angiograms(
-    out: Path, settings: AngiogramSettings, progress: OnProgress, *, record: Record | None = None
-) -> dict[str, Angiogram]:
-    """Compute the angiogram of every flow of a case folder, and write curves, numbers and metrics.
+    out: Path, settings: AngiogramSettings, progress: OnProgress
+) -> tuple[dict[str, Angiogram], dict[str, History]]:
+    """Return angiogram and contrast of every flow of a case folder, ``bare`` first, and write curves and metrics.
 
-    An angiogram that is stored for the same flow and settings is not computed again, unless its frames are watched.
-
-    Parameters
-    ----------
-    out : the case folder of a finished run with flows.
-    settings : settings of the angiograms.
-    progress : called at every stage.
-    record : returns what watches the frames of a flow (see `Record`).
-
-    Returns angiograms by name of the flow, ``bare`` first.
+    Those that are stored for the same flow and settings are not computed again.
 
     Raises
     ------
@@ -64,13 +51,13 @@ def angiograms(
     """
     source, study = finished_run(out)
     with claimed(out):
-        store = Store(out / CACHE, progress)
-        keys = study_keys(source, study)
+        store, keys = Store(out / CACHE, progress), study_keys(source, study)
         anatomy = finished_anatomy(out, store, keys)
         flows = _flow_keys(keys)
-        found = {name: _one(out, anatomy, name, key, settings, store, record) for name, key in flows.items()}
+        both = {name: angiogram_of(out, anatomy, name, key, settings, store) for name, key in flows.items()}
+        found = {name: one for name, (one, _) in both.items()}
         _write(out, found, settings, flows)
-    return found
+    return found, {name: history for name, (_, history) in both.items()}
 
 
 def _flow_keys(keys: Mapping[str, Key]) -> dict[str, Key]:
@@ -78,99 +65,75 @@ def _flow_keys(keys: Mapping[str, Key]) -> dict[str, Key]:
     return {stage.removeprefix("flow "): key for stage, key in keys.items() if stage.startswith("flow ")}
 
 
-def _one(
-    out: Path,
-    anatomy: Anatomy,
-    name: str,
-    key: Key,
-    settings: AngiogramSettings,
-    store: Store,
-    record: Record | None,
-) -> Angiogram:
-    """Return the angiogram of one flow, stored or computed."""
-    stage, own = f"angiogram {name}", angiogram_key(key, settings)
-    carrier = cache(lambda: store.find(f"flow {name}", key, FlowField))
-    with nullcontext() if record is None else record(name, key, store, carrier) as watch:
-        found = None if watch else store.find(stage, own, Angiogram)
-        if found is not None:
-            return found
-        field = carrier()
-        if field is None:
-            raise InputError(
-                f"{out} holds no flow of {name}, and contrast moves with the flow: run the case again without --no-flow"
-            )
-        with store.stage(stage) as tell:
-            found = angiogram(anatomy, field, settings, watch=watch, progress=_teller(store, stage))
-            tell(found.advice)
-        store.keep(stage, own, found)
-        return found
-
-
-def _teller(store: Store, stage: str) -> Callable[[float], None]:
-    """Return a function that reports a finished fraction with the time that is left."""
+def angiogram_of(
+    out: Path, anatomy: Anatomy, name: str, flow: Key, settings: AngiogramSettings, store: Store
+) -> tuple[Angiogram, History]:
+    """Return the angiogram of one flow and its contrast over time, stored or computed."""
+    stage, stage_of_history, key = f"angiogram {name}", f"contrast {name}", angiogram_key(flow, settings)
+    history = store.load(stage_of_history, key, History)
+    found = None if history is None else store.find(stage, key, Angiogram)
+    if history is not None and found is not None:
+        return found, history
+    field = store.find(f"flow {name}", flow, FlowField)
+    if field is None:
+        raise InputError(
+            f"{out} holds no flow of {name}, and contrast moves with the flow: run the case again without --no-flow"
+        )
+    recorder = Recorder(field, entering(settings.bolus, field)[1], begin_s=settings.bolus.begin_s)
     began = time.monotonic()
 
-    def tell(part: float) -> None:
+    def told(part: float) -> None:
         left_s = (time.monotonic() - began) * (1 - part) / part if part > 0 else None
         store.progress(stage, 0.99 * part, "", seconds_left=left_s)
 
-    return tell
+    with store.stage(stage) as tell:
+        found = angiogram(anatomy, field, settings, watch=recorder.watch, progress=told)
+        tell(found.advice)
+    history = recorder.history()
+    store.save(stage, key, found)
+    store.save(stage_of_history, key, history)
+    return found, history
 
 
 def _write(out: Path, found: Mapping[str, Angiogram], settings: AngiogramSettings, keys: Mapping[str, Key]) -> None:
     """Write the curves, the numbers, and the metrics with the numbers added."""
     folder = out / FOLDER
     folder.mkdir(exist_ok=True)
-    former = _former_keys(folder / NUMBERS)
-    write_rows(folder / CURVES, list(_rows(found)))
+    former = {key for flow in _written(out).values() for key in flow["measures"]}
+    rows = [
+        {
+            "flow": name,
+            "time_s": float(time_s),
+            "sac_iodine_mg_mL": float(sac),
+            "parent_artery_iodine_mg_mL": float(parent),
+        }
+        for name, one in found.items()
+        for time_s, sac, parent in zip(one.curves.time_s, one.curves.sac_mg_mL, one.curves.parent_mg_mL, strict=True)
+    ]
+    write_rows(folder / CURVES, rows)
     flows = {
         name: {"flow": str(keys[name]), "measures": one.measures, "advice": one.advice} for name, one in found.items()
     }
     write_json(folder / NUMBERS, {"settings": asdict(settings), "flows": flows, "research_use_only": True})
     metrics = json.loads((out / METRICS).read_text(encoding="utf-8"))
-    _drop(metrics, former)
+    for treatment in metrics["treatments"].values():  # a new angiogram need not have all measures of the former
+        for part, gone in (("flow", former), ("change", {f"{key}_ratio" for key in former})):
+            for key in gone & treatment.get(part, {}).keys():
+                del treatment[part][key]
     add_measures(metrics, {name: one.measures for name, one in found.items()})
     write_json(out / METRICS, metrics)
 
 
-def _rows(found: Mapping[str, Angiogram]) -> Iterator[dict[str, Any]]:
-    """Yield the rows of the table of curves."""
-    for name, one in found.items():
-        curves = one.curves
-        for time_s, sac, parent in zip(curves.time_s, curves.sac_mg_mL, curves.parent_mg_mL, strict=True):
-            yield {
-                "flow": name,
-                "time_s": float(time_s),
-                "sac_iodine_mg_mL": float(sac),
-                "parent_artery_iodine_mg_mL": float(parent),
-            }
-
-
-def _former_keys(path: Path) -> set[str]:
-    """Return the keys of all measures of the angiograms that a case folder holds; empty where it holds none."""
-    try:
-        flows = json.loads(path.read_text(encoding="utf-8"))["flows"]
-        return {key for one in flows.values() for key in one["measures"]}
-    except UNREADABLE:
-        return set()
-
-
-def _drop(metrics: dict[str, Any], keys: set[str]) -> None:
-    """Remove measures of earlier angiograms from nested metrics: a new one need not have all of them."""
-    for treatment in metrics["treatments"].values():
-        for part, gone in (("flow", keys), ("change", {f"{key}_ratio" for key in keys})):
-            for key in gone & treatment.get(part, {}).keys():
-                del treatment[part][key]
+def _written(out: Path) -> dict[str, Any]:
+    """Return key and measures of the angiograms that a case folder holds, by name of the flow."""
+    with suppress(*UNREADABLE):
+        flows = json.loads((out / FOLDER / NUMBERS).read_text(encoding="utf-8"))["flows"]
+        return {name: {"flow": str(one["flow"]), "measures": dict(one["measures"])} for name, one in flows.items()}
+    return {}
 
 
 def add_measures(metrics: dict[str, Any], measures: Mapping[str, Mapping[str, float]]) -> None:
-    """Add the measures of angiograms to the flows of nested metrics.
-
-    Parameters
-    ----------
-    metrics : metrics of a case; changed in place.
-    measures : measures by treatment.
-    """
+    """Add the measures of angiograms, by treatment, to the flows of nested metrics in place."""
     for name, values in measures.items():
         treatment = metrics["treatments"].get(name, {})
         if "flow" in treatment:
@@ -179,11 +142,23 @@ def add_measures(metrics: dict[str, Any], measures: Mapping[str, Mapping[str, fl
             treatment["change"].update(ratios(dict(measures.get(BARE, {})), dict(values)))
 
 
-def kept_measures(out: Path, keys: Mapping[str, Key]) -> dict[str, dict[str, float]]:
+def stored_measures(out: Path, keys: Mapping[str, Key]) -> dict[str, dict[str, float]]:
     """Return the measures of the angiograms in a case folder that belong to the flows of a run, by name."""
-    try:
-        flows = json.loads((out / FOLDER / NUMBERS).read_text(encoding="utf-8"))["flows"]
-        own = {name: str(key) for name, key in _flow_keys(keys).items()}
-        return {name: dict(one["measures"]) for name, one in flows.items() if one["flow"] == own.get(name)}
-    except UNREADABLE:
-        return {}
+    own = {name: str(key) for name, key in _flow_keys(keys).items()}
+    return {name: one["measures"] for name, one in _written(out).items() if one["flow"] == own.get(name)}
+
+
+def stents_of(out: Path, names: Iterable[str]) -> tuple[Anatomy, dict[str, list[Stent]]]:
+    """Return the anatomy of a finished case folder, and the implants of the named treatments as its run deployed them.
+
+    Raises
+    ------
+    ReadError
+        The folder holds no finished run of this version.
+    """
+    source, study = finished_run(out)
+    store, keys = Store(out / CACHE), study_keys(source, study)
+    anatomy = finished_anatomy(out, store, keys)
+    chosen = replace(study, treatments=tuple(one for one in study.treatments if one.name in set(names)))
+    deployed = deploy_all(anatomy, chosen, store, keys)[0] if chosen.treatments else {}
+    return anatomy, {name: [one.stent for one in implants.values()] for name, implants in deployed.items()}

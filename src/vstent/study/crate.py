@@ -12,6 +12,7 @@ from typing import Any, Final
 
 from vstent.errors import ReadError
 from vstent.io.writers import write_json
+from vstent.study.folder import METRICS
 
 NAME: Final = "ro-crate-metadata.json"
 """File name of the description."""
@@ -60,91 +61,61 @@ ABOUT: Final = {
 def write_crate(folder: Path, provenance: Mapping[str, Any], when: str) -> None:
     """Describe every file of a finished case folder in ``ro-crate-metadata.json``; hidden files are left out.
 
-    Parameters
-    ----------
-    folder : the case folder.
-    provenance : content of its ``run.json``.
-    when : date of the run, ISO 8601.
-
-    Raises
-    ------
-    ReadError
-        The folder holds no finished case.
+    `provenance` is the content of its ``run.json``, and `when` the date of the run (ISO 8601). ReadError: there is no
+    finished case.
     """
-    if not (folder / "metrics.json").exists():
+    if not (folder / METRICS).exists():
         raise ReadError(f"{folder} holds no finished case. Run it first.")
-    paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and _is_shown(path.relative_to(folder))]
-    files = [_file(folder, path) for path in paths]
-    write_json(
-        folder / NAME,
-        {
-            "@context": "https://w3id.org/ro/crate/1.1/context",
-            "@graph": [*_crate(folder, files, when), *files, *_making(provenance, files, when)],
-        },
-    )
-
-
-def _is_shown(path: Path) -> bool:
-    """Return whether a file is described: it is neither hidden nor the description itself."""
-    return path.name != NAME and not any(part.startswith(".") for part in path.parts)
-
-
-def _file(folder: Path, path: Path) -> dict[str, Any]:
-    """Return the entry of a file, with its size and SHA-256."""
-    with path.open("rb") as stream:
-        digest = hashlib.file_digest(stream, "sha256")
-    return {
-        "@id": path.relative_to(folder).as_posix(),
-        "@type": "File",
-        "name": ABOUT.get(path.name, path.name),
-        "encodingFormat": FORMATS.get(path.suffix, "application/octet-stream"),
-        "contentSize": str(path.stat().st_size),
-        "sha256": digest.hexdigest(),
+    files: list[dict[str, Any]] = []
+    for path in sorted(folder.rglob("*")):
+        place = path.relative_to(folder)
+        if not path.is_file() or path.name == NAME or any(part.startswith(".") for part in place.parts):
+            continue
+        with path.open("rb") as stream:
+            digest = hashlib.file_digest(stream, "sha256")
+        files.append(
+            {
+                "@id": place.as_posix(),
+                "@type": "File",
+                "name": ABOUT.get(path.name, path.name),
+                "encodingFormat": FORMATS.get(path.suffix, "application/octet-stream"),
+                "contentSize": str(path.stat().st_size),
+                "sha256": digest.hexdigest(),
+            }
+        )
+    description = {
+        "@id": NAME,
+        "@type": "CreativeWork",
+        "conformsTo": {"@id": "https://w3id.org/ro/crate/1.1"},
+        "about": {"@id": "./"},
     }
-
-
-def _crate(folder: Path, files: list[dict[str, Any]], when: str) -> list[dict[str, Any]]:
-    """Return the entries of the description itself and of the case folder."""
-    return [
-        {
-            "@id": NAME,
-            "@type": "CreativeWork",
-            "conformsTo": {"@id": "https://w3id.org/ro/crate/1.1"},
-            "about": {"@id": "./"},
-        },
-        {
-            "@id": "./",
-            "@type": "Dataset",
-            "name": f"Virtual stenting of {folder.resolve().name}",
-            "description": "A virtual stenting by vstent. Research use only: not for diagnosis or treatment.",
-            "datePublished": when,
-            "license": "Not for publication unless the holder of the rights in the scan agrees",
-            "hasPart": [{"@id": file["@id"]} for file in files],
-            "mentions": {"@id": "#run"},
-        },
-    ]
-
-
-def _making(provenance: Mapping[str, Any], files: list[dict[str, Any]], when: str) -> list[dict[str, Any]]:
-    """Return the entries of program, input and run."""
-    given = provenance["input"]
-    return [
-        {
-            "@id": "#vstent",
-            "@type": "SoftwareApplication",
-            "name": "vstent",
-            "version": provenance["versions"]["vstent"],
-            "license": {"@id": LICENSE},
-        },
-        {"@id": LICENSE, "@type": "CreativeWork", "name": "BSD 3-Clause"},
-        {"@id": "#input", "@type": "CreativeWork", "name": given["name"], "sha256": given["sha256"]},
-        {
-            "@id": "#run",
-            "@type": "CreateAction",
-            "name": "vstent run",
-            "endTime": when,
-            "instrument": {"@id": "#vstent"},
-            "object": {"@id": "#input"},
-            "result": [{"@id": file["@id"]} for file in files],
-        },
-    ]
+    case = {
+        "@id": "./",
+        "@type": "Dataset",
+        "name": f"Virtual stenting of {folder.resolve().name}",
+        "description": "A virtual stenting by vstent. Research use only: not for diagnosis or treatment.",
+        "datePublished": when,
+        "license": "Not for publication unless the holder of the rights in the scan agrees",
+        "hasPart": [{"@id": file["@id"]} for file in files],
+        "mentions": {"@id": "#run"},
+    }
+    program = {
+        "@id": "#vstent",
+        "@type": "SoftwareApplication",
+        "name": "vstent",
+        "version": provenance["versions"]["vstent"],
+        "license": {"@id": LICENSE},
+    }
+    run = {
+        "@id": "#run",
+        "@type": "CreateAction",
+        "name": "vstent run",
+        "endTime": when,
+        "instrument": {"@id": "#vstent"},
+        "object": {"@id": "#input"},
+        "result": case["hasPart"],
+    }
+    license_ = {"@id": LICENSE, "@type": "CreativeWork", "name": "BSD 3-Clause"}
+    given = {"@id": "#input", "@type": "CreativeWork"} | {key: provenance["input"][key] for key in ("name", "sha256")}
+    graph = [description, case, *files, program, license_, given, run]
+    write_json(folder / NAME, {"@context": "https://w3id.org/ro/crate/1.1/context", "@graph": graph})

@@ -8,7 +8,7 @@ import numpy as np
 from vstent.io.dicom_writer import write_dicom
 from vstent.kernels import curves
 from vstent.phantoms import Phantom, demo_phantom, scan
-from vstent.study.types import CaseResult
+from vstent.study.pipeline import CaseResult
 
 SEED: Final = 20161  # seed of the scan's noise; the value is arbitrary
 END_DIAMETERS: Final = 1.0

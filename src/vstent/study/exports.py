@@ -10,60 +10,44 @@ import numpy as np
 from vstent.devices.stent import Stent
 from vstent.errors import FlowError, InputError
 from vstent.fields import differing
-from vstent.flow.case import FlowCase
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.openfoam import program
-from vstent.flow.openfoam.case import FoamCase, foam_case, strut_solids
-from vstent.flow.openfoam.dialects import Flavour
+from vstent.flow.openfoam.case import foam_case, strut_solids
 from vstent.flow.openfoam.folder import write
 from vstent.flow.openfoam.patches import named_patches, stl_text
 from vstent.flow.openfoam.setup import FoamSetup
 from vstent.flow.problem import flow_case
 from vstent.geometry.vessel import Anatomy
 from vstent.io import writers
-from vstent.io.archive import load_data
 from vstent.study.folder import CACHE, RUN, refuse_older
 from vstent.study.keys import anatomy_keys, hash_of
 from vstent.study.progress import OnProgress
 from vstent.study.repeat import finished_run
 from vstent.study.settings import AnatomySettings, InputSettings, Settings
-from vstent.study.stages import check_inflow, deploy_implant, find_anatomy
+from vstent.study.stages import check_inflow, deploy_implant, find_anatomy, finished_anatomy
 from vstent.study.store import Store
 
 
-def export_openfoam(
-    path: Path, out: Path, settings: Settings, foam: Mapping[str, Any], progress: OnProgress
-) -> tuple[FlowCase, FoamCase]:
-    """Write an OpenFOAM case folder.
+def export_openfoam(path: Path, out: Path, settings: Settings, foam: Mapping[str, Any], progress: OnProgress) -> None:
+    """Write an OpenFOAM case folder of a case folder of `run`, or of a scan or surface.
 
-    Parameters
-    ----------
-    path : a case folder of `run`, or a scan or surface.
-    out : the folder to write.
-    settings : settings of the study; the wires of its first treatment, if any, are meshed.
-    foam : fields of `FoamSetup` to set; the default flavor is that of the installed OpenFOAM.
-    progress : called at every stage.
-
-    Returns
-    -------
-    written : the files of the OpenFOAM case.
-
-    Raises
-    ------
-    InputError
-        An input or option cannot be used; nothing has been written.
+    The wires of the first treatment, if any, are meshed. `foam` has fields of `FoamSetup`; the default flavor is
+    that of the installed OpenFOAM. Where InputError is raised, nothing has been written.
     """
     store = Store(out / CACHE, progress)
     anatomy = _anatomy(path, settings, store)
     check_inflow(anatomy, settings.flow)
     case = flow_case(anatomy, _implants(path, anatomy, settings, store), settings.flow)
     setup = FoamSetup(default_cell_size_mm(case), processes=case.numerics.processes)
-    setup = replace(setup, **{"flavour": _flavour_here(), **foam}, struts=strut_solids(case))
+    try:
+        installed = program.find().flavour
+    except FlowError:
+        installed = "com"
+    setup = replace(setup, **{"flavour": installed, **foam}, struts=strut_solids(case))
     with store.stage("export") as tell:
         written = foam_case(case, setup)
         write(out, written)
         tell(f"{len(written.files)} files for {written.application}, grid spacing {setup.cell_size_mm:.3g} mm.")
-    return case, written
 
 
 def export_patches(path: Path, out: Path, settings: Settings, progress: OnProgress) -> list[dict[str, Any]]:
@@ -71,18 +55,6 @@ def export_patches(path: Path, out: Path, settings: Settings, progress: OnProgre
 
     ``patches.stl`` has one named solid per patch, ``patches.vtp`` the same faces with their ``patch_id``, both in mm.
     ``patches.json`` describes the patches, and ``neck.stl`` is the surface through which blood enters the sac.
-
-    Parameters
-    ----------
-    path : a case folder of `run`, or a scan or surface.
-    out : the folder to write.
-    settings : settings of the vessel.
-    progress : called at every stage.
-
-    Raises
-    ------
-    InputError
-        An input or option cannot be used; nothing has been written.
     """
     store = Store(out / CACHE, progress)
     case = flow_case(_anatomy(path, settings, store))
@@ -92,7 +64,20 @@ def export_patches(path: Path, out: Path, settings: Settings, progress: OnProgre
         said = []
         for k, patch in enumerate(patches):
             patch_id[patch.face_id] = k
-            said.append({"name": patch.name, "patch_id": k, "area_mm2": patch.area_mm2, **_middle(patch.corners_mm)})
+            first, second, third = np.moveaxis(patch.corners_mm, 1, 0)
+            area_mm2 = 0.5 * np.cross(second - first, third - first)
+            total_mm2 = area_mm2.sum(axis=0)
+            said.append(
+                {
+                    "name": patch.name,
+                    "patch_id": k,
+                    "area_mm2": patch.area_mm2,
+                    "center_mm": np.average(
+                        patch.corners_mm.mean(axis=1), axis=0, weights=np.linalg.norm(area_mm2, axis=1)
+                    ),
+                    "normal": total_mm2 / max(float(np.linalg.norm(total_mm2)), 1e-12),
+                }
+            )
         writers.write_text(out / "patches.stl", stl_text({one.name: one.corners_mm for one in patches}, 1.0))
         writers.write_surface(out / "patches.vtp", patches[0].surface, cell_data={"patch_id": patch_id})
         if case.ostium is not None:
@@ -102,27 +87,17 @@ def export_patches(path: Path, out: Path, settings: Settings, progress: OnProgre
     return said
 
 
-def _middle(corners_mm: np.ndarray) -> dict[str, Any]:
-    """Return the area-weighted center and the mean unit normal of triangles (m, 3, 3)."""
-    area_mm2 = 0.5 * np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
-    size_mm2 = np.linalg.norm(area_mm2, axis=1)
-    total = area_mm2.sum(axis=0)
-    center_mm = np.average(corners_mm.mean(axis=1), axis=0, weights=size_mm2)
-    return {"center_mm": center_mm, "normal": total / max(float(np.linalg.norm(total)), 1e-12)}
-
-
 def _anatomy(path: Path, settings: Settings, store: Store) -> Anatomy:
-    """Return the anatomy stored in a case folder, or that of an input."""
+    """Return the anatomy of the run of a case folder, or that of an input."""
     refuse_older(path, "Run its study again into another folder, and export that.")
-    kept = sorted((path / CACHE).glob("anatomy-*.npz")) if path.is_dir() else []
-    if not kept:
+    if not (path / CACHE).is_dir():
         return find_anatomy(path, settings, store, anatomy_keys(hash_of(path), settings))
     given = [*differing(InputSettings(), settings.input), *differing(AnatomySettings(), settings.anatomy)]
     if given:
         words = ", ".join(f"--{name}" for name in given)
         raise InputError(f"{path} is a case folder, whose vessel is exported as it is: leave out {words}")
     with store.stage("anatomy") as tell:
-        anatomy = load_data(kept[-1], Anatomy)
+        anatomy = finished_anatomy(path, Store(path / CACHE), anatomy_keys(*finished_run(path)))
         tell(f"taken from {path}")
     return anatomy
 
@@ -142,11 +117,3 @@ def _implants(path: Path, anatomy: Anatomy, settings: Settings, store: Store) ->
             tell(deployment.advice)
         stents[implant.id] = deployment.stent
     return list(stents.values())
-
-
-def _flavour_here() -> Flavour:
-    """Return the flavor of the installed OpenFOAM; ``com`` where none is installed."""
-    try:
-        return program.find().flavour
-    except FlowError:
-        return "com"

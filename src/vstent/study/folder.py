@@ -19,6 +19,8 @@ RUN: Final = "run.json"
 """File of the case folder with the provenance of the run."""
 INPUT: Final = "input.json"
 """File in the cache folder with the path of the input; not for sharing, because the path may name the patient."""
+METRICS: Final = "metrics.json"
+"""File of the case folder with all metrics."""
 LAYOUT: Final = 3
 """Number of the layout of case folders, as stated by the files `RUN` and `INPUT`."""
 LOCK: Final = "lock"
@@ -28,22 +30,16 @@ TREATMENTS: Final = "treatments"
 """Subfolder of the case folder with a folder for every treatment."""
 
 Given = ParamSpec("Given")
-Found = TypeVar("Found")
-Study = Callable[Concatenate[Path, Path, Given], Found]
-"""Function of an input, a case folder and further arguments."""
+Result = TypeVar("Result")
 
 
-def claiming(study: Study[Given, Found]) -> Callable[Concatenate[Path | str, Path | str, Given], Found]:
-    """Decorate a study so that it reserves its case folder (the second argument) while it runs.
-
-    Raises
-    ------
-    FolderError
-        Another process uses the folder, or it cannot be written; see `claimed`.
-    """
+def claiming(
+    study: Callable[Concatenate[Path, Path, Given], Result],
+) -> Callable[Concatenate[Path | str, Path | str, Given], Result]:
+    """Decorate a study so that it reserves its case folder (the second argument) while it runs (`claimed`)."""
 
     @wraps(study)
-    def alone(path: Path | str, out: Path | str, /, *args: Given.args, **given: Given.kwargs) -> Found:
+    def alone(path: Path | str, out: Path | str, /, *args: Given.args, **given: Given.kwargs) -> Result:
         with claimed(Path(out)):
             return study(Path(path), Path(out), *args, **given)
 
@@ -74,10 +70,6 @@ def claimed(out: Path) -> Iterator[None]:
 
     Files that a killed process left half-written there are removed. Folders created here are removed at the end if they
     are empty.
-
-    Parameters
-    ----------
-    out : the case folder; it is created if it does not exist.
 
     Raises
     ------
@@ -116,30 +108,23 @@ def _locked(path: Path) -> IO[str]:
     while True:
         file = path.open("a+", encoding="utf-8")
         try:
-            _lock(file, path)
-            is_there = path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat())
+            with suppress(ImportError):  # Windows has no such locks, so two processes may use the folder at once
+                import fcntl
+
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                file.truncate(0)
+                file.write(f"process {os.getpid()} on {platform.node()}")
+                file.flush()
+                return file
+        except BlockingIOError:
+            file.seek(0)
+            who = file.read().strip() or "another process"
+            file.close()
+            raise FolderError(
+                f"{path.parent.parent} is in use by {who}: wait until that run ends, or give another --out"
+            ) from None
         except BaseException:
             file.close()
             raise
-        if is_there:  # a process that ends removes the file, perhaps between opening and locking
-            file.truncate(0)
-            file.write(f"process {os.getpid()} on {platform.node()}")
-            file.flush()
-            return file
-        file.close()
-
-
-def _lock(file: IO[str], path: Path) -> None:
-    """Lock a file; raise FolderError where another process holds the lock."""
-    try:
-        import fcntl
-    except ImportError:  # Windows has no such locks, so two processes may use the folder at once
-        return
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        file.seek(0)
-        who = file.read().strip() or "another process"
-        raise FolderError(
-            f"{path.parent.parent} is in use by {who}: wait until that run ends, or give another --out"
-        ) from None
+        file.close()  # a process that ended has removed the file, perhaps between opening and locking

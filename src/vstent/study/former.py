@@ -10,7 +10,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
-from vstent.devices.treatment import Treatment
 from vstent.errors import InputError
 from vstent.fields import differing
 from vstent.io.writers import write_json
@@ -38,16 +37,10 @@ def note_begun(out: Path, settings: Settings) -> None:
 
 
 def merged(out: Path, source: str, settings: Settings) -> Settings:
-    """Return the settings of a run merged with those of the earlier runs of the case folder.
+    """Return the settings of a run of an input, with its SHA-256 `source`, merged with those of the folder's last run.
 
     Earlier treatments come first and keep their sizes, places and flows; new ones are added. Where a run requests no
     flow, new treatments get none and existing flows are kept.
-
-    Parameters
-    ----------
-    out : the case folder.
-    source : SHA-256 of the input.
-    settings : settings of the new run.
 
     Raises
     ------
@@ -58,17 +51,19 @@ def merged(out: Path, source: str, settings: Settings) -> Settings:
     former = former_settings(out)
     if former is None:
         return settings
-    refuse_other_anatomy(out, settings, former)
+    refuse_other_anatomy(out, settings)
     before, now = ({one.name: one for one in run.treatments} for run in (former, settings))
     treatments = []
     for name in {**before, **now}:
         old, new = before.get(name), now.get(name)
         if new and not (out / TREATMENTS / name).exists():  # the old one failed, or was not reached
             old = None
-        one = _same(out, f"sizes or places of {name}", old and replace(old, has_flow=True), _of_use(old, new))
-        had_flow = old is not None and old.has_flow and former.flow is not None
-        gets_flow = new is not None and new.has_flow and settings.flow is not None
-        treatments.append(replace(one, has_flow=had_flow or gets_flow))
+        runs = ((old, former.flow), (new, settings.flow))
+        has_flow = any(one is not None and one.has_flow and flow is not None for one, flow in runs)
+        if old and new and new.is_proposed and old.devices == new.devices:
+            new = None  # it leaves sizes and places to the old one
+        given = (one and replace(one, has_flow=has_flow) for one in (old, new))
+        treatments.append(_same(out, f"sizes or places of {name}", *given))
     flow = _same(out, "flow settings", former.flow, settings.flow)
     return replace(
         former,
@@ -78,22 +73,15 @@ def merged(out: Path, source: str, settings: Settings) -> Settings:
     )
 
 
-def _of_use(old: Treatment | None, new: Treatment | None) -> Treatment | None:
-    """Return a new treatment; None where it leaves sizes and places to those of an old one with the same devices."""
-    if old and new and new.is_proposed and old.devices == new.devices:
-        return None
-    return new and replace(new, has_flow=True)
-
-
 def refuse_other_input(out: Path, source: str) -> None:
     """Raise InputError where a case folder holds results of an input with another SHA-256 than `source`."""
     if former_source(out) not in (source, None):
         raise InputError(f"{out} holds the results of another input. Give another --out, or --replace to replace them.")
 
 
-def refuse_other_anatomy(out: Path, settings: Settings, former: Settings | None = None) -> None:
+def refuse_other_anatomy(out: Path, settings: Settings) -> None:
     """Raise InputError where a case folder holds results of an anatomy found with other settings."""
-    former = former or former_settings(out)
+    former = former_settings(out)
     if former is None:
         return
     changed = [*differing(former.input, settings.input), *differing(former.anatomy, settings.anatomy)]

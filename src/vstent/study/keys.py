@@ -5,7 +5,7 @@ A key contains the keys of the results that are used, the settings of the stage,
 """
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -20,8 +20,6 @@ from vstent.study.store import Key, digest
 
 if TYPE_CHECKING:
     from vstent.angiography.angiogram import AngiogramSettings
-    from vstent.devices.design import Design
-    from vstent.flow.settings import FlowSettings
     from vstent.study.settings import Settings
 
 ANATOMY: Final = "anatomy"
@@ -31,13 +29,9 @@ VESSEL: Final = "vessel"
 
 
 def key_of(entry: str, *parts: Any, without: tuple[str, ...] = ()) -> Key:
-    """Return the key of a result.
+    """Return the key of a result of a module or function (``module:function``) without modules that it does not use.
 
-    Parameters
-    ----------
-    entry : module or function (``module:function``) that computes it.
-    parts : all that it depends on: keys of other results, settings and other plain values.
-    without : prefixes of modules that it does not use.
+    The parts are all that it depends on: keys of other results, settings and other plain values.
     """
     return Key(digest(parts), digest([code_of(entry, without), *(key.code for key in _keys_in(parts))]))
 
@@ -52,13 +46,7 @@ def _keys_in(parts: Any) -> Iterator[Key]:
 
 
 def anatomy_keys(source: str, settings: "Settings") -> dict[str, Key]:
-    """Return the keys of the vessel and the anatomy of an input, by name.
-
-    Parameters
-    ----------
-    source : SHA-256 of the input.
-    settings : settings of the study.
-    """
+    """Return the keys of the vessel and the anatomy of an input, with its SHA-256 `source`, by name."""
     given = settings.anatomy
     vessel = key_of("vstent.study.stages:find_vessel", source, settings.input, given.at_mm, given.inlet_mm)
     return {VESSEL: vessel, ANATOMY: key_of("vstent.study.stages:find_anatomy", vessel, given)}
@@ -83,35 +71,10 @@ def implant_keys(anatomy: Key, treatment: Treatment) -> dict[str, Key]:
     return keys
 
 
-def flow_key(anatomy: Key, implants: Iterable[Key], flow: "FlowSettings") -> Key:
-    """Return the key of one flow."""
-    deployed = list(implants)
-    unused = () if deployed else ("vstent.deployment",)
-    if flow.numerics.engine == LATTICE:
-        unused = (*unused, "vstent.flow.openfoam")
-    return key_of("vstent.study.stages:compute_flow", anatomy, deployed, flow, without=unused)
-
-
-def uncertainty_key(implant: Key, settings: "Settings", design: "Design") -> Key:
-    """Return the key of the uncertainty study of one implant."""
-    assert settings.uncertainty is not None
-    numbers = settings.uncertainty.numbers_of(design)
-    flow, unused = (settings.flow, ()) if settings.uncertainty.flow_samples else (None, ("vstent.flow",))
-    return key_of("vstent.plan.uncertainty", implant, settings.uncertainty, numbers, flow, without=unused)
-
-
 def study_keys(source: str, settings: "Settings") -> dict[str, Key]:
-    """Return the keys of all stages of a study by their name in the store, in the order in which they are computed.
+    """Return the keys of all stages of a study of an input, with its SHA-256 `source`, by their name in the store.
 
-    Parameters
-    ----------
-    source : SHA-256 of the input.
-    settings : settings of the study.
-
-    Raises
-    ------
-    DeviceError
-        There is no device of a name that a treatment states.
+    They are in the order in which they are computed. DeviceError is raised where a device does not exist.
     """
     keys = anatomy_keys(source, settings)
     anatomy = keys[ANATOMY]
@@ -120,27 +83,26 @@ def study_keys(source: str, settings: "Settings") -> dict[str, Key]:
         for implant in treatment.implants:
             keys[f"deploy {stage_name(treatment, implant)}"] = deployed[treatment.name][implant.id]
     if settings.flow is not None:
-        flown: dict[str, dict[str, Key]] = {BARE: {}} | {
-            one.name: deployed[one.name] for one in settings.treatments if one.has_flow
-        }
-        keys |= {f"flow {name}": flow_key(anatomy, of.values(), settings.flow) for name, of in flown.items()}
+        flown = [treatment.name for treatment in settings.treatments if treatment.has_flow]
+        of_engine = ("vstent.flow.openfoam",) if settings.flow.numerics.engine == LATTICE else ()
+        for name in (BARE, *flown):
+            implants = [*deployed[name].values()] if name != BARE else []
+            unused = (*(() if implants else ("vstent.deployment",)), *of_engine)
+            used = anatomy, implants, settings.flow
+            keys[f"flow {name}"] = key_of("vstent.study.stages:compute_flow", *used, without=unused)
     if settings.uncertainty is not None:
+        flow, unused = (settings.flow, ()) if settings.uncertainty.flow_samples else (None, ("vstent.flow",))
         for treatment in settings.treatments:
             if len(treatment.implants) == 1:
                 (key,), (device,) = deployed[treatment.name].values(), treatment.devices
-                keys[f"vary {treatment.name}"] = uncertainty_key(key, settings, find_design(device))
+                numbers = settings.uncertainty.numbers_of(find_design(device))
+                varied = key, settings.uncertainty, numbers, flow
+                keys[f"vary {treatment.name}"] = key_of("vstent.plan.uncertainty", *varied, without=unused)
     return keys
 
 
 def measures_key(settings: "Settings", keys: Mapping[str, Key], failures: Mapping[str, str]) -> Key:
-    """Return the key of all metrics of a study.
-
-    Parameters
-    ----------
-    settings : settings of the study.
-    keys : keys of its stages, of `study_keys`.
-    failures : reasons why a treatment was not deployed or its flow not computed, by name.
-    """
+    """Return the key of all metrics of a study, from the keys of its stages and the reasons of what failed, by name."""
     designs = [find_design(name) for name in settings.devices]
     used = list(keys.values()), designs, settings.treatments, dict(failures)
     return key_of("vstent.study.stages:measure_study", *used)
@@ -152,16 +114,7 @@ def angiogram_key(flow: Key, settings: "AngiogramSettings") -> Key:
 
 
 def hash_of(path: Path) -> str:
-    """Return the SHA-256 of an input.
-
-    It covers the contents of all files of the input. For a folder these are its DICOM files in the order of their
-    paths, with their names.
-
-    Raises
-    ------
-    ReadError
-        The input does not exist, or is neither a file nor a folder.
-    """
+    """Return the SHA-256 of all files of an input; of a folder these are the DICOM files in order, with their names."""
     existing(path)
     digest = hashlib.sha256()
     for file in files_of(path):

@@ -21,8 +21,8 @@ from vstent.io.tables import columns_of, write_rows
 from vstent.io.three_mf import write_3mf
 from vstent.plan.rank import Ranking, order_of
 from vstent.study.crate import NAME as CRATE
-from vstent.study.folder import RUN
-from vstent.study.provenance import METRICS
+from vstent.study.folder import METRICS, RUN
+from vstent.study.store import UNREADABLE
 
 IMPLANT: Final = ("contour.vtp", "wires.vtp", "struts.stl", "struts.3mf")
 """Files of one implant."""
@@ -55,25 +55,26 @@ RESULTS: Final = (
 
 def take_away_results(out: Path) -> None:
     """Remove the results in a case folder; the cache and the user's own files stay."""
-    _take_away(out, RESULTS, list(out.glob(f"**/{KEY}")))
+    _take_away(out, RESULTS, out.glob(f"**/{KEY}"))
 
 
-def take_away_study(out: Path, kept: Collection[Path]) -> None:
-    """Remove the results of a study with other settings."""
-    _take_away(out, OF_STUDY, [key for key in out.glob(f"treatments/*/flow/*/{KEY}") if key.parent not in kept])
+def take_away_study(out: Path, engine_folders: Collection[Path]) -> None:
+    """Remove the results of a study with other settings, except what an engine needs in these folders."""
+    keys = out.glob(f"treatments/*/flow/*/{KEY}")
+    _take_away(out, OF_STUDY, [key for key in keys if key.parent not in engine_folders])
 
 
 def take_away_measures(out: Path) -> None:
     """Remove the results that describe a replaced anatomy alone."""
-    _take_away(out, OF_ANATOMY, list(out.glob(f"convergence/**/{KEY}")))
+    _take_away(out, OF_ANATOMY, out.glob(f"convergence/**/{KEY}"))
 
 
 def _take_away(out: Path, patterns: Iterable[str], keys: Iterable[Path]) -> None:
     """Remove files by pattern, OpenFOAM's folders by their key files, and folders that are then empty."""
+    for key in list(keys):
+        shutil.rmtree(key.parent)
     for file in [file for pattern in patterns for file in out.glob(pattern)]:
         file.unlink()
-    for key in keys:
-        shutil.rmtree(key.parent)
     for folder in [folder for pattern in FOLDERS for folder in out.glob(pattern)]:
         with suppress(OSError):  # it is not empty
             folder.rmdir()
@@ -140,34 +141,17 @@ def write_ranking(out: Path, ranking: Ranking) -> None:
     """Write a ranking as ``ranking.csv`` and, with its criteria, as ``ranking.json``.
 
     Stored rows of other devices are kept if they have the same criteria.
-
-    Parameters
-    ----------
-    out : the case folder.
-    ranking : the ranking.
     """
     criteria = [item.model_dump(exclude_none=True) for item in ranking.criteria.items]
-    new = ranking.rows()
-    columns = columns_of(new)
-    former = _former_rows(out / "ranking.json", ranking, criteria)
-    # JSON files have sorted keys: a former row in first place must not order the columns of the table.
-    rows = _ranked([*new, *({name: row[name] for name in columns if name in row} | row for row in former)])
+    devices = {candidate.design.key for candidate in ranking.candidates}
+    rows = ranking.rows()
+    columns = columns_of(rows)
+    with suppress(*UNREADABLE):
+        former = json.loads((out / "ranking.json").read_text(encoding="utf-8"))
+        if former["criteria"] == json.loads(json.dumps(criteria)):
+            kept = [row for row in former["candidates"] if row["device"] not in devices]
+            # JSON files have sorted keys: a former row in first place must not order the columns of the table.
+            rows += [{name: row[name] for name in columns if name in row} | row for row in kept]
+    rows = [row | {"rank": number} for number, row in enumerate(sorted(rows, key=order_of), start=1)]
     write_rows(out / "ranking.csv", rows)
     writers.write_json(out / "ranking.json", {"criteria": criteria, "candidates": rows, "research_use_only": True})
-
-
-def _ranked(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the rows of a ranking in order, numbered anew."""
-    return [row | {"rank": number} for number, row in enumerate(sorted(rows, key=order_of), start=1)]
-
-
-def _former_rows(path: Path, ranking: Ranking, criteria: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the rows of an earlier ranking by the same criteria for devices that the new ranking does not include."""
-    try:
-        former = json.loads(path.read_text(encoding="utf-8"))
-        if former["criteria"] != json.loads(json.dumps(criteria)):
-            return []
-        devices = {candidate.design.key for candidate in ranking.candidates}
-        return [dict(row) for row in former["candidates"] if row["device"] not in devices]
-    except (OSError, ValueError, KeyError, TypeError):
-        return []

@@ -5,21 +5,25 @@ no files. After that each finished stage is stored in the folder under a key of 
 same study reads it instead of computing it.
 """
 
-from collections.abc import Mapping
-from dataclasses import asdict
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from vstent.anatomy.morphology import morphology
 from vstent.devices.stent import Deployment
-from vstent.flow.convergence import Sensitivity
+from vstent.devices.treatment import BARE
+from vstent.flow.case import FlowField
+from vstent.flow.convergence import Sensitivity, convergence
+from vstent.flow.problem import flow_case
+from vstent.flow.settings import FlowSettings
 from vstent.flow.simulation import check_engine
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io import writers
-from vstent.study.contrast import add_measures, kept_measures
+from vstent.study.contrast import add_measures, stored_measures
 from vstent.study.crate import NAME as CRATE
-from vstent.study.folder import CACHE, INPUT, LAYOUT, RUN, claiming, implant_folder
+from vstent.study.folder import CACHE, INPUT, LAYOUT, METRICS, RUN, TREATMENTS, claiming, implant_folder
 from vstent.study.former import merged, note_begun, refuse_other_anatomy, refuse_other_input
 from vstent.study.keys import ANATOMY, VESSEL, anatomy_keys, hash_of, key_of, measures_key, stage_name, study_keys
 from vstent.study.outputs import (
@@ -32,8 +36,7 @@ from vstent.study.outputs import (
     write_vessel,
 )
 from vstent.study.progress import OnProgress, Progress
-from vstent.study.provenance import METRICS, provenance
-from vstent.study.repeat import SECONDS, former_source, is_of_another
+from vstent.study.repeat import SECONDS, former_source, is_of_another, provenance
 from vstent.study.settings import Settings
 from vstent.study.stages import (
     check_inflow,
@@ -43,14 +46,42 @@ from vstent.study.stages import (
     find_anatomy,
     find_vessel,
     measure_study,
-    refine,
+    plan_flows,
     vary_all,
 )
-from vstent.study.store import Store, silent
-from vstent.study.types import CaseResult, Computed
+from vstent.study.store import Key, Store, silent
 
-Implants = Mapping[str, Mapping[str, Deployment]]
-"""Deployed implants by treatment and id."""
+
+@dataclass(frozen=True, eq=False)
+class Computed:
+    """What a study has computed before it is measured; enough to draw it."""
+
+    anatomy: Anatomy
+    """Vessel, sacs and paths."""
+    implants: Mapping[str, Mapping[str, Deployment]]
+    """Deployed implants by treatment and id."""
+    fields: Mapping[str, FlowField]
+    """Flows by treatment, ``bare`` first; empty where no flow was requested."""
+    whole: Vessel | None
+    """The vessel before it was trimmed; None where it is not stored."""
+
+
+@dataclass(frozen=True, eq=False)
+class CaseResult(Computed):
+    """Result of a study."""
+
+    name: str
+    """Name of the case folder (the name of a scan may be the patient's)."""
+    metrics: dict[str, Any]
+    """Metrics: ``vessel``, ``treatments.NAME.{implants.ID,flow,change,quality}``; the end of each key is its unit."""
+    provenance: dict[str, Any]
+    """Versions, input with hash, settings, seconds per stage."""
+    failures: dict[str, str]
+    """Reason why a treatment was not deployed or its flow not computed, by treatment."""
+    notes: tuple[str, ...]
+    """Findings, assumptions and repairs, and the reliability of every flow, one sentence each."""
+    keys: dict[str, Key]
+    """Keys of the stages by name."""
 
 
 @claiming
@@ -100,9 +131,10 @@ def run(
     anatomy = find_anatomy(path, settings, store, keys)
     check_inflow(anatomy, settings.flow)
     implants, failures = deploy_all(anatomy, settings, store, keys)
-    told = provenance(path, source, settings)
-    has_former = replaces and is_of_another(out, told)
-    _settle(path, out, source, store)
+    record = provenance(path, source, settings)
+    has_former = replaces and is_of_another(out, record)
+    named = [treatment.name for treatment in settings.treatments]
+    _save_deferred(path, out, source, store, named, is_replaced=has_former)
     note_begun(out, settings)
     if has_former:
         take_away_study(out, engine_folders(out, settings).values())
@@ -117,25 +149,25 @@ def run(
     fields, unflown = compute_flows(out, anatomy, implants, settings, store, keys)
     failures |= unflown
     varied = vary_all(anatomy, implants, settings, store, keys)
-    found = Computed(anatomy, implants, fields, store.peek(VESSEL, keys[VESSEL], Vessel))
+    computed = Computed(anatomy, implants, fields, store.load(VESSEL, keys[VESSEL], Vessel))
 
     def measures() -> dict[str, Any]:
-        progress(Progress("measure", 0.0, computed=found))
+        progress(Progress("measure", 0.0, computed=computed))
         return measure_study(anatomy, implants, fields, settings, varied, failures)
 
     metrics = store.compute_once("measure", measures_key(settings, keys, failures), measures)
-    add_measures(metrics, kept_measures(out, keys) if fields else {})
+    add_measures(metrics, stored_measures(out, keys) if fields else {})
     writers.write_json(out / METRICS, metrics)
-    told[SECONDS] = store.seconds
-    writers.write_json(out / RUN, told, is_exact=True)
+    record[SECONDS] = store.seconds
+    writers.write_json(out / RUN, record, is_exact=True)
     of_flows = (f"Flow, {name}: {field.advice}" for name, field in fields.items())
     of_failures = (f"{name}: {sentence}" for name, sentence in failures.items())
     notes = (*of_failures, *anatomy.vessel.notes, *anatomy.notes, *of_flows)
     return CaseResult(
-        **vars(found),
+        **vars(computed),
         name=out.resolve().name,
         metrics=metrics,
-        provenance=told,
+        provenance=record,
         failures=failures,
         notes=notes,
         keys=keys,
@@ -144,28 +176,10 @@ def run(
 
 @claiming
 def trace_vessel(path: Path, out: Path, settings: Settings, progress: OnProgress, *, replaces: bool = False) -> Vessel:
-    """Find the vessel, its openings and its centerlines, untrimmed, and write them.
-
-    Parameters
-    ----------
-    path : a scan or a surface.
-    out : the folder to write.
-    settings : settings of the study; missing values are proposed.
-    progress : called at every stage.
-    replaces : whether results of another input or of other settings are replaced.
-
-    Raises
-    ------
-    InputError
-        An input or option cannot be used; nothing has been written.
-    FolderError
-        Another process uses the folder, or it cannot be written.
-    """
-    store = Store(out / CACHE, progress)
-    source = hash_of(path)
-    _refuse_loss(out, source, settings, replaces)
+    """Find the vessel, its openings and its centerlines, untrimmed, and write them; all else as in `run`."""
+    store, source = _begun(path, out, settings, progress, replaces)
     vessel = find_vessel(path, settings, store, anatomy_keys(source, settings))
-    _settle(path, out, source, store)
+    _save_deferred(path, out, source, store)
     write_vessel(out, vessel)
     return vessel
 
@@ -174,36 +188,14 @@ def trace_vessel(path: Path, out: Path, settings: Settings, progress: OnProgress
 def restore_vessel(
     path: Path, out: Path, settings: Settings, progress: OnProgress, *, replaces: bool = False
 ) -> tuple[Anatomy, dict[str, Any]]:
-    """Remove the sac, restore the parent artery, measure both, and write them.
+    """Remove the sac, restore the parent artery, write both, and return them with their morphology.
 
-    A study in the same folder reuses the result, and the other way round.
-
-    Parameters
-    ----------
-    path : a scan or a surface.
-    out : the case folder.
-    settings : settings of the study; missing values are proposed.
-    progress : called at every stage.
-    replaces : whether results of another input or of other settings are replaced.
-
-    Returns
-    -------
-    anatomy : vessel, parent artery and sacs.
-    measures : Morphology; the end of each key is its unit.
-
-    Raises
-    ------
-    InputError
-        An input or option cannot be used; nothing has been written.
-    FolderError
-        Another process uses the folder, or it cannot be written.
+    A study in the same folder reuses the result, and the other way round. Errors and `replaces` are as in `run`.
     """
-    store = Store(out / CACHE, progress)
-    source = hash_of(path)
-    _refuse_loss(out, source, settings, replaces)
+    store, source = _begun(path, out, settings, progress, replaces)
     anatomy = find_anatomy(path, settings, store, anatomy_keys(source, settings))
     measures = morphology(anatomy)
-    _settle(path, out, source, store)
+    _save_deferred(path, out, source, store)
     write_anatomy(out, anatomy)
     writers.write_json(out / "morphology.json", measures)
     return anatomy, measures
@@ -215,50 +207,56 @@ def refine_flow(
 ) -> Sensitivity:
     """Compute the flow without a device on three grids, time steps and grid positions; write ``convergence.json``.
 
-    Parameters
-    ----------
-    path : a scan or a surface.
-    out : the case folder.
-    settings : settings of the study; its grid spacing, given or proposed, is the finest.
-    progress : called at every stage.
-    replaces : whether results of another input or of other settings are replaced.
-
-    Raises
-    ------
-    InputError
-        An input or option cannot be used; nothing has been written.
-    FlowError
-        A flow could not be computed.
-    FolderError
-        Another process uses the folder, or it cannot be written.
+    The grid spacing of the settings, given or proposed, is the finest. Errors and `replaces` are as in `run`.
     """
     check_engine(settings.flow)
-    store = Store(out / CACHE, progress)
-    source = hash_of(path)
-    _refuse_loss(out, source, settings, replaces)
+    store, source = _begun(path, out, settings, progress, replaces)
     anatomy = find_anatomy(path, settings, store, anatomy_keys(source, settings))
     check_inflow(anatomy, settings.flow)
-    _settle(path, out, source, store)
-    found = refine(out, anatomy, settings, store)
-    kept = {one.name: asdict(one) for one in found.refinements}
-    kept["grid_position"] = {key: asdict(one) for key, one in found.positions.items()}
-    writers.write_json(out / "convergence.json", kept)
-    return found
+    _save_deferred(path, out, source, store)
+    flow = settings.flow or FlowSettings()
+    plan_flows(anatomy, {BARE: ()}, flow, store)
+    with store.stage("convergence") as tell:
+        sentences: list[str] = []
+
+        def told(fraction: float, sentence: str) -> None:
+            sentences.append(sentence)
+            store.progress("convergence", 0.99 * fraction, sentence)
+
+        folder = out / "convergence" / flow.numerics.engine
+        sensitivity = convergence(flow_case(anatomy, (), flow), folder=folder, told=told)
+        tell(" ".join(sentences))
+    refinements = {one.name: asdict(one) for one in sensitivity.refinements}
+    refinements["grid_position"] = {key: asdict(one) for key, one in sensitivity.positions.items()}
+    writers.write_json(out / "convergence.json", refinements)
+    return sensitivity
 
 
-def _refuse_loss(out: Path, source: str, settings: Settings, replaces: bool) -> None:
-    """Raise InputError where a folder holds results of another input or anatomy, unless they are to be replaced."""
+def _begun(path: Path, out: Path, settings: Settings, progress: OnProgress, replaces: bool) -> tuple[Store, str]:
+    """Return the store of a case folder and the SHA-256 of an input; results of another one are refused or replaced."""
+    source = hash_of(path)
     if not replaces:
         refuse_other_input(out, source)
         refuse_other_anatomy(out, settings)
+    return Store(out / CACHE, progress), source
 
 
-def _settle(path: Path, out: Path, source: str, store: Store) -> None:
-    """Store the results held in memory, and remove results of another input or of a replaced anatomy."""
+def _save_deferred(
+    path: Path, out: Path, source: str, store: Store, named: Iterable[str] = (), *, is_replaced: bool = False
+) -> None:
+    """Store the deferred results, and remove results of another input or of a replaced anatomy.
+
+    Treatments that are not `named` are reported where they are removed with their study, here or by the caller.
+    """
     former = former_source(out)
-    if former not in (source, None):
+    is_of_other_input = former not in (source, None)
+    removed = {folder.name for folder in (out / TREATMENTS).glob("*")} - {BARE, *named}
+    if removed and (is_of_other_input or is_replaced):
+        names = ", ".join(sorted(removed))
+        store.progress("stored results", 1.0, f"removed, because this command replaces them by none: {names}.")
+    if is_of_other_input:
         take_away_results(out)
-    elif former is not None and store.is_held(ANATOMY):
+    elif former is not None and store.is_deferred(ANATOMY):
         take_away_measures(out)
     writers.write_json(out / CACHE / INPUT, {"layout": LAYOUT, "path": str(path.resolve()), "sha256": source})
-    store.settle()
+    store.save_deferred()

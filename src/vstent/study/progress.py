@@ -20,7 +20,7 @@ class Progress:
     seconds_left: float | None = None
     """Estimated remaining run time in s; None: unknown."""
     computed: Any = None
-    """What is about to be measured (`vstent.study.types.Computed`), where the stage ``measure`` begins."""
+    """What is about to be measured (`vstent.study.pipeline.Computed`), where the stage ``measure`` begins."""
 
 
 OnProgress = Callable[[Progress], None]

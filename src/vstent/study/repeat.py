@@ -1,24 +1,29 @@
-"""Repeat a run from its `run.json`, and compare the results."""
+"""Record of a run in its `run.json`: everything needed to repeat it. Repeat a run, and compare the results."""
 
 import json
-from collections.abc import Mapping
+import platform
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from vstent.devices.catalogue import find_design
 from vstent.errors import InputError, ReadError
+from vstent.flow.lattice.gpu import gpu_name
 from vstent.io.files import existing
-from vstent.study.folder import CACHE, INPUT, LAYOUT, RUN
+from vstent.study.folder import CACHE, INPUT, LAYOUT, METRICS, RUN
 from vstent.study.keys import hash_of
-from vstent.study.provenance import METRICS, devices_of, machine, versions
 from vstent.study.settings import Settings
-from vstent.study.store import UNREADABLE
+from vstent.study.store import UNREADABLE, digest
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
 
+PACKAGES: Final = ("vstent", "numpy", "scipy", "numba", "vtk", "SimpleITK", "pydicom")
+"""Packages whose versions are recorded."""
 MISSING: Final = "absent"
 """Text for a value that a record does not state."""
 SECONDS: Final = "seconds"
@@ -28,6 +33,29 @@ TOLERANCE: Final = 1e-3
 processor with and without wide and fused instructions: 2e-4 for a steady flow."""
 ROUNDING: Final = 1e-9
 """Absolute difference, in the unit of a metric, below which two values near zero are equal."""
+
+
+def provenance(path: Path, source: str, settings: Settings) -> dict[str, Any]:
+    """Return everything that the results of an input, with its SHA-256 `source`, depend on."""
+    return {
+        "layout": LAYOUT,
+        **_surroundings(settings),
+        "input": {"name": "DICOM folder" if path.is_dir() else path.name, "sha256": source},
+        "settings": asdict(settings),
+        "research_use_only": True,
+    }
+
+
+def _surroundings(settings: Settings) -> dict[str, dict[str, str]]:
+    """Return versions, machine and devices: all that may change a result besides input and settings."""
+    machine = {"system": platform.system(), "processor": platform.machine()}
+    if settings.flow is not None and settings.flow.numerics.device_gpu:
+        machine["gpu"] = gpu_name()
+    return {
+        "versions": {name: version(name) for name in PACKAGES} | {"python": platform.python_version()},
+        "machine": machine,
+        "devices": {name: digest(find_design(name)) for name in settings.devices},  # a catalogue can change
+    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,12 +73,7 @@ class Record:
 
 
 def read_record(path: Path, moved_to: Path | None = None) -> Record:
-    """Read a ``run.json`` and find its input.
-
-    Parameters
-    ----------
-    path : the file, in its case folder.
-    moved_to : present path of the input; None: the recorded path.
+    """Read the ``run.json`` of a case folder and find its input, at the recorded path or where it has been moved to.
 
     Raises
     ------
@@ -62,25 +85,22 @@ def read_record(path: Path, moved_to: Path | None = None) -> Record:
     try:
         told, settings = told_in(existing(path))
         sha256 = str(told["input"]["sha256"])
-        differences = _differences(told, settings)
+        changed = differences(told, settings)
     except UNREADABLE:
         raise ReadError(f"{path} is not a run.json of this version: give the scan and the options again") from None
-    source = moved_to or _input(path.parent)
-    if not source.exists():
-        raise ReadError(f"{source}, the input of {path}, does not exist: give its present place with --input")
-    if hash_of(source) != sha256:
-        raise InputError(f"{source} is not the input of {path}, or has changed since: give that input with --input")
-    return Record(path.parent, source, settings, differences)
-
-
-def _input(folder: Path) -> Path:
-    """Return the recorded path of the input of a case folder."""
+    folder = path.parent
     try:
-        return Path(json.loads((folder / CACHE / INPUT).read_text(encoding="utf-8"))["path"])
+        recorded = json.loads((folder / CACHE / INPUT).read_text(encoding="utf-8"))["path"] if not moved_to else ""
     except UNREADABLE:
         raise ReadError(
             f"{folder} does not state the place of its input (its folder {CACHE} is missing): give it with --input"
         ) from None
+    source = moved_to or Path(recorded)
+    if not source.exists():
+        raise ReadError(f"{source}, the input of {path}, does not exist: give its present place with --input")
+    if hash_of(source) != sha256:
+        raise InputError(f"{source} is not the input of {path}, or has changed since: give that input with --input")
+    return Record(folder, source, settings, changed)
 
 
 def former_source(folder: Path) -> str | None:
@@ -112,10 +132,6 @@ def told_in(run: Path) -> tuple[dict[str, Any], Settings]:
 def finished_run(out: Path) -> tuple[str, Settings]:
     """Return the SHA-256 of the input and the settings of the run of a case folder.
 
-    Parameters
-    ----------
-    out : the case folder.
-
     Raises
     ------
     ReadError
@@ -131,13 +147,7 @@ def finished_run(out: Path) -> tuple[str, Settings]:
 
 
 def settings_of(told: Mapping[str, Any]) -> Settings:
-    """Return the settings stated by a ``run.json``.
-
-    Raises
-    ------
-    ValueError
-        A setting is missing or has an impossible value, or this version does not know it.
-    """
+    """Return the settings stated by a ``run.json``; ValueError where they are not those of this version."""
     found = _adapter().validate_python(dict(told))
     if json.loads(json.dumps(asdict(found))) != json.loads(json.dumps(told)):
         raise ValueError("these are not all settings of this version, or others")
@@ -152,29 +162,18 @@ def _adapter() -> "TypeAdapter[Settings]":
     return TypeAdapter(Settings)
 
 
-def _differences(told: Mapping[str, Any], settings: Settings) -> tuple[str, ...]:
+def differences(told: Mapping[str, Any], settings: Settings) -> tuple[str, ...]:
     """Return the differences between a recorded run and the present versions, machine and devices."""
-    now = {"versions": versions(), "machine": machine(settings), "devices": devices_of(settings.devices)}
     return tuple(
         f"{name.replace('_', ' ')} ({part}): {told.get(part, {}).get(name, MISSING)} before, {value} now"
-        for part, values in now.items()
+        for part, values in _surroundings(settings).items()
         for name, value in values.items()
         if told.get(part, {}).get(name, MISSING) != value
     )
 
 
 def agreement(first: Path, second: Path) -> str:
-    """Return a sentence on how well the metrics of two case folders agree.
-
-    Parameters
-    ----------
-    first, second : case folders.
-
-    Raises
-    ------
-    ReadError
-        One of them has no metrics.
-    """
+    """Return a sentence on how well the metrics of two case folders agree; ReadError where one has none."""
     try:
         one, other = ((folder / METRICS).read_bytes() for folder in (first, second))
     except OSError as error:
@@ -206,9 +205,10 @@ def _relative(one: Any, other: Any) -> float:
     return 0.0 if apart < ROUNDING else float(apart / max(abs(one), abs(other)))
 
 
-def _numbers(values: Mapping[str, Any], before: str = "") -> list[tuple[str, Any]]:
-    """Return all values of nested metrics with dotted names."""
-    found = []
+def _numbers(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield all values of nested metrics with dotted names."""
     for name, value in values.items():
-        found += _numbers(value, f"{before}{name}.") if isinstance(value, Mapping) else [(f"{before}{name}", value)]
-    return found
+        if isinstance(value, Mapping):
+            yield from _numbers(value, f"{before}{name}.")
+        else:
+            yield f"{before}{name}", value

@@ -22,11 +22,11 @@ from vstent.devices.catalogue import find_design, find_sizes
 from vstent.devices.design import Size
 from vstent.devices.ranges import how_sure
 from vstent.devices.stent import Deployment, Landing, Stent
-from vstent.devices.treatment import BARE, Implant, Treatment
+from vstent.devices.treatment import BARE, Implant
 from vstent.errors import DeviceError, FlowError, InputError, LandingError, ReadError, VstentError
 from vstent.flow.background import BackgroundWork
-from vstent.flow.case import FlowCase, FlowField
-from vstent.flow.convergence import Sensitivity, convergence
+from vstent.flow.case import FlowField
+from vstent.flow.engines import Progress as FlowProgress
 from vstent.flow.grade import computation_of, grade
 from vstent.flow.indices import indices, ratios
 from vstent.flow.ostium import ostium
@@ -56,35 +56,34 @@ NEAR_MM: Final = 3.0
 
 
 def find_anatomy(path: Path, settings: Settings, store: Store, keys: Mapping[str, Key]) -> Anatomy:
-    """Read, segment, repair, trace, trim and restore; a result stored for this input is returned without computation.
+    """Return the anatomy of an input, stored or computed; the store writes a new one when `save_deferred` is called.
 
-    The store keeps the result in memory until its `settle` writes it.
-
-    Parameters
-    ----------
-    path : a scan or a surface.
-    settings : settings of the study.
-    store : results of the study.
-    keys : keys of its stages, of `vstent.study.keys`.
-
-    Raises
-    ------
-    InputError
-        An input or option cannot be used. Where no vessel is found at the point `at_mm`, the message proposes the same
-        point in another frame or as a voxel index, if there is a vessel.
+    Where no vessel is found at the point `at_mm`, the error proposes the same point in another frame or as a voxel
+    index, if there is a vessel.
     """
-    kept = store.find(ANATOMY, keys[ANATOMY], Anatomy)
-    if kept is not None:
-        return kept
+    anatomy = store.find(ANATOMY, keys[ANATOMY], Anatomy)
+    if anatomy is not None:
+        return anatomy
+    given = settings.anatomy
     try:
-        return _find_anatomy(path, settings, store, keys)
+        whole = find_vessel(path, settings, store, keys)
+        neck_mm, outlet_mm = _array(given.neck_mm), _array(given.outlet_mm)
+        at_mm = _array(given.at_mm) if neck_mm is None else neck_mm.mean(axis=0)
+        if outlet_mm is not None:
+            opening_at(whole, outlet_mm)  # checked before trimming, which may cut this outlet off
+        with store.stage("trim") as tell:
+            traced = trim(whole, at_mm=at_mm, upstream_mm=given.upstream_mm, downstream_mm=given.downstream_mm)
+            tell(" ".join(traced.notes[len(whole.notes) :]))
+        with store.stage("restore") as tell:
+            anatomy = restore(traced, at_mm=_array(given.at_mm), outlet_mm=outlet_mm, neck_mm=neck_mm)
+            tell(" ".join([*anatomy.notes, *(f"Sac volume {a.sac.volume_mm3:.0f} mm3." for a in anatomy.aneurysms)]))
     except InputError as error:
-        if settings.anatomy.at_mm is None or settings.anatomy.neck_mm is not None:
+        question = "" if given.at_mm is None or given.neck_mm is not None else other_reading(path, settings)
+        if not question:
             raise
-        found = other_reading(path, settings)
-        if not found:
-            raise
-        raise type(error)(f"{error} {found}") from error
+        raise type(error)(f"{error} {question}") from error
+    store.defer(ANATOMY, keys[ANATOMY], anatomy)
+    return anatomy
 
 
 def other_reading(path: Path, settings: Settings) -> str:
@@ -92,8 +91,7 @@ def other_reading(path: Path, settings: Settings) -> str:
     for words, point_mm in _readings(path, settings):
         with suppress(VstentError):
             vessel = trace(_vessel(path, replace(settings, anatomy=replace(settings.anatomy, at_mm=point_mm))))
-            near_mm = vessel.lumen.closest(np.array([point_mm]))[1][0]
-            if near_mm < NEAR_MM:
+            if vessel.lumen.closest(np.array([point_mm]))[1][0] < NEAR_MM:
                 return f"Did you mean {','.join(f'{x:.1f}' for x in point_mm)} ({words})?"
     return ""
 
@@ -112,33 +110,11 @@ def _readings(path: Path, settings: Settings) -> Iterator[tuple[str, Point]]:
     yield "with the second sign changed", (x, -y, z)
 
 
-def _find_anatomy(path: Path, settings: Settings, store: Store, keys: Mapping[str, Key]) -> Anatomy:
-    """Return the anatomy of an input, computed."""
-    given = settings.anatomy
-    whole = find_vessel(path, settings, store, keys)
-    neck_mm = None if given.neck_mm is None else np.array(given.neck_mm, dtype=np.float64)
-    at_mm = _array(given.at_mm) if neck_mm is None else neck_mm.mean(axis=0)
-    outlet_mm = _array(given.outlet_mm)
-    if outlet_mm is not None:
-        opening_at(whole, outlet_mm)  # checked before trimming, which may cut this outlet off
-    with store.stage("trim") as tell:
-        traced = trim(whole, at_mm=at_mm, upstream_mm=given.upstream_mm, downstream_mm=given.downstream_mm)
-        tell(" ".join(traced.notes[len(whole.notes) :]))
-    with store.stage("restore") as tell:
-        anatomy = restore(traced, at_mm=_array(given.at_mm), outlet_mm=outlet_mm, neck_mm=neck_mm)
-        tell(" ".join([*anatomy.notes, *(f"Sac volume {a.sac.volume_mm3:.0f} mm3." for a in anatomy.aneurysms)]))
-    store.hold(ANATOMY, keys[ANATOMY], anatomy)
-    return anatomy
-
-
 def find_vessel(path: Path, settings: Settings, store: Store, keys: Mapping[str, Key]) -> Vessel:
-    """Read, segment, repair and trace; a result stored for this input is returned without computation.
-
-    The store keeps the result in memory until its `settle` writes it.
-    """
-    kept = store.find(VESSEL, keys[VESSEL], Vessel)
-    if kept is not None:
-        return kept
+    """Return the traced vessel of an input, stored or computed; the store writes a new one as in `find_anatomy`."""
+    traced = store.find(VESSEL, keys[VESSEL], Vessel)
+    if traced is not None:
+        return traced
     with store.stage("segment") as tell:
         vessel = _vessel(path, settings)
         tell(" ".join(vessel.notes))
@@ -147,7 +123,7 @@ def find_vessel(path: Path, settings: Settings, store: Store, keys: Mapping[str,
         widths = ", ".join(f"{inlet.role} {inlet.diameter_mm:.1f} mm wide" for inlet in traced.inlets)
         found = f"{counted(len(traced.outlets), 'outlet')}; {widths}."
         tell(" ".join([found, *traced.notes[len(vessel.notes) :]]))
-    store.hold(VESSEL, keys[VESSEL], traced)
+    store.defer(VESSEL, keys[VESSEL], traced)
     return traced
 
 
@@ -170,55 +146,39 @@ def finished_anatomy(out: Path, store: Store, keys: Mapping[str, Key]) -> Anatom
 def deploy_all(
     anatomy: Anatomy, settings: Settings, store: Store, keys: Mapping[str, Key]
 ) -> tuple[dict[str, dict[str, Deployment]], dict[str, str]]:
-    """Deploy the implants of every treatment in the given or the proposed sizes; stored ones are not computed again.
+    """Return the implants of every treatment, stored or deployed, and the reasons why treatments do not fit, by name.
 
-    Raises
-    ------
-    DeviceError, LandingError
-        No treatment can be deployed; the reason is that of the last one.
+    DeviceError or LandingError is raised where no treatment can be deployed; the reason is that of the last one.
     """
-    found: dict[str, dict[str, Deployment]] = {}
+    deployed: dict[str, dict[str, Deployment]] = {}
     failures: dict[str, str] = {}
     for treatment in settings.treatments:
+        implants: dict[str, Deployment] = {}
         try:
-            found[treatment.name] = _deployed(treatment, anatomy, store, keys)
+            for implant in treatment.implants:
+                stage = f"deploy {stage_name(treatment, implant)}"
+                deployment = store.find(stage, keys[stage], Deployment)
+                if deployment is None:
+                    with store.stage(stage) as tell:
+                        deployment = deploy_implant(implant, anatomy, [implants[name].stent for name in implant.inside])
+                        tell(deployment.advice)
+                    store.defer(stage, keys[stage], deployment)
+                implants[implant.id] = deployment
+            deployed[treatment.name] = implants
         except (DeviceError, LandingError) as error:
+            if len(treatment.implants) > 1:
+                error.args = (f"{implant.id}, an implant of {treatment.name}: {error}",)
             if len(failures) + 1 == len(settings.treatments):  # the last one too
+                if len(treatment.implants) == 1:
+                    error.args = (f"{treatment.name}: {error}",)
                 raise
             failures[treatment.name] = f"not deployed: {error}"
             store.progress(f"deploy {treatment.name}", 1.0, failures[treatment.name])
-    return found, failures
-
-
-def _deployed(treatment: Treatment, anatomy: Anatomy, store: Store, keys: Mapping[str, Key]) -> dict[str, Deployment]:
-    """Return the deployed implants of a treatment by id, each stored or computed."""
-    found: dict[str, Deployment] = {}
-    for implant in treatment.implants:
-        stage = f"deploy {stage_name(treatment, implant)}"
-        deployment = store.find(stage, keys[stage], Deployment)
-        if deployment is None:
-            with store.stage(stage) as tell:
-                try:
-                    deployment = deploy_implant(implant, anatomy, [found[name].stent for name in implant.inside])
-                except (DeviceError, LandingError) as error:
-                    if len(treatment.implants) > 1:
-                        error.args = (f"{implant.id}, an implant of {treatment.name}: {error}",)
-                    raise
-                tell(deployment.advice)
-            store.hold(stage, keys[stage], deployment)
-        found[implant.id] = deployment
-    return found
+    return deployed, failures
 
 
 def deploy_implant(implant: Implant, anatomy: Anatomy, inside: Sequence[Stent] = ()) -> Deployment:
-    """Deploy an implant in the given size and place; missing values are proposed.
-
-    Parameters
-    ----------
-    implant : the implant.
-    anatomy : vessel, sacs and paths.
-    inside : implants that are there before it, in the order of their deployment.
-    """
+    """Deploy an implant in the given or proposed size and place, inside implants that are there in this order."""
     anatomy = on_path(anatomy, implant.placing.path)
     size = size_of(implant, anatomy)
     landing = landing_of(implant, anatomy, size)
@@ -226,14 +186,7 @@ def deploy_implant(implant: Implant, anatomy: Anatomy, inside: Sequence[Stent] =
 
 
 def landing_of(implant: Implant, anatomy: Anatomy, size: Size) -> Landing | None:
-    """Return the given place of an implant, or the proposed one with the given shift; None where neither is given.
-
-    Parameters
-    ----------
-    implant : the implant.
-    anatomy : vessel, sacs and paths, that of the implant in the first place.
-    size : size of the implant.
-    """
+    """Return the given place of an implant on the first path, or the proposed one shifted; None where none is given."""
     placing = implant.placing
     if placing.position_mm is not None:
         return Landing(placing.position_mm, placing.anchor)
@@ -244,32 +197,13 @@ def landing_of(implant: Implant, anatomy: Anatomy, size: Size) -> Landing | None
 
 
 def on_path(anatomy: Anatomy, name: str) -> Anatomy:
-    """Return the anatomy with a path in the first place, where implants are deployed.
-
-    Raises
-    ------
-    InputError
-        There is no path of this name.
-    """
+    """Return the anatomy with a path in the first place, where implants are deployed."""
     path = anatomy.path(name)
     return replace(anatomy, paths=(path, *(other for other in anatomy.paths if other is not path)))
 
 
 def size_of(implant: Implant, anatomy: Anatomy) -> Size:
-    """Return the given size of an implant; where diameter or length is missing, the best of the matching sizes.
-
-    Parameters
-    ----------
-    implant : the implant.
-    anatomy : vessel, sacs and paths.
-
-    Raises
-    ------
-    DeviceError
-        The device is not made in that size.
-    LandingError
-        No matching size fits the artery.
-    """
+    """Return the given size of an implant; where diameter or length is missing, the best of the matching sizes."""
     design = find_design(implant.device)
     sizes = find_sizes(design, diameter_mm=implant.diameter_mm, length_mm=implant.length_mm)
     if implant.diameter_mm is not None and implant.length_mm is not None:
@@ -278,13 +212,7 @@ def size_of(implant: Implant, anatomy: Anatomy) -> Size:
 
 
 def check_inflow(anatomy: Anatomy, flow: FlowSettings | None) -> None:
-    """Refuse a mean inflow that no artery has, because it is probably in another unit.
-
-    Raises
-    ------
-    InputError
-        The mean speed at an inlet is implausible.
-    """
+    """Raise InputError where no artery has the given mean inflow: it is probably in another unit."""
     if flow is None or flow.inflow_mL_s is None:
         return
     case = vessel_case(anatomy.vessel, flow)
@@ -313,29 +241,25 @@ def compute_flows(
     store: Store,
     keys: Mapping[str, Key],
 ) -> tuple[dict[str, FlowField], dict[str, str]]:
-    """Compute the flow in the bare artery and with every treatment; each is stored as soon as it is finished.
+    """Return the flow in the bare artery and with every treatment, and the reasons why others failed, by name.
 
-    With a GPU it is stored while the next one is computed.
-
-    Raises
-    ------
-    FlowError
-        The flow in the bare artery could not be computed.
+    Each is stored as soon as it is finished; with a GPU while the next one is computed. FlowError is raised where the
+    flow in the bare artery cannot be computed.
     """
     if settings.flow is None:
         return {}, {}
     fields: dict[str, FlowField] = {}
     failures: dict[str, str] = {}
-    folders, stored = engine_folders(out, settings), []
-    stents = {BARE: [], **{name: [one.stent for one in found.values()] for name, found in implants.items()}}
-    names = (BARE, *(one.name for one in settings.treatments if one.has_flow and one.name in implants))
+    folders = engine_folders(out, settings)
+    writing: list[Callable[[], None]] = []
+    stents = {BARE: [], **{name: [one.stent for one in deployed.values()] for name, deployed in implants.items()}}
     with BackgroundWork(settings.flow.numerics) as background:
-        for name in names:
-            stage, keep = f"flow {name}", None
+        for name in (BARE, *(one.name for one in settings.treatments if one.has_flow and one.name in implants)):
+            stage = f"flow {name}"
             field = store.find(stage, keys[stage], FlowField)
             if field is None:
                 if name == BARE:
-                    _plan(anatomy, stents, settings.flow, store)
+                    plan_flows(anatomy, stents, settings.flow, store)
                 try:
                     with store.stage(stage) as tell:
                         field = compute_flow(
@@ -344,7 +268,7 @@ def compute_flows(
                             settings.flow,
                             start=fields.get(BARE),
                             folder=folders[name],
-                            progress=store.teller(stage),
+                            progress=partial(_tell_flow, store, stage),
                             unfinished=store.unfinished(stage, keys[stage]),
                         )
                         tell(field.advice)
@@ -354,19 +278,18 @@ def compute_flows(
                     failures[name] = f"flow not computed: {error}"
                     store.progress(stage, 1.0, failures[name])
                     continue
-                keep = store.keeping(stage, keys[stage], field)
+                writing.append(background.begin(store.saver(stage, keys[stage], field)))
             fields[name] = field
-            stored.append(background.begin(partial(_keep, keep, flow_folder(out, name), field)))
-    for done in stored:
-        done()
+            writing.append(background.begin(partial(write_field, flow_folder(out, name), field)))
+    for is_written in writing:
+        is_written()
     return fields, failures
 
 
-def _keep(keep: Callable[[], None] | None, folder: Path, field: FlowField) -> None:
-    """Store a flow, unless it was read from the store, and write its files."""
-    if keep is not None:
-        keep()
-    write_field(folder, field)
+def _tell_flow(store: Store, stage: str, now: FlowProgress) -> None:
+    """Report the progress of a flow as that of its stage."""
+    residual = now.residual if isfinite(now.residual) else None
+    store.progress(stage, min(now.fraction, 0.99), "", residual=residual, seconds_left=now.seconds_left)
 
 
 def compute_flow(
@@ -384,37 +307,12 @@ def compute_flow(
     return simulate_case(case, start=start, folder=folder, progress=progress, checkpoint=unfinished)
 
 
-def refine(out: Path, anatomy: Anatomy, settings: Settings, store: Store) -> Sensitivity:
-    """Compute the flow without a device on three grids, with three time steps and in three positions on the grid.
-
-    Parameters
-    ----------
-    out : the case folder.
-    anatomy : vessel, parent artery and sacs.
-    settings : settings of the study; the grid spacing is that of the finest grid.
-    store : results of the study.
-    """
-    flow = settings.flow or FlowSettings()
-    _plan(anatomy, {BARE: ()}, flow, store)
-    with store.stage("convergence") as tell:
-        done: list[str] = []
-
-        def told(fraction: float, sentence: str) -> None:
-            done.append(sentence)
-            store.progress("convergence", 0.99 * fraction, sentence)
-
-        folder = out / "convergence" / flow.numerics.engine
-        found = convergence(flow_case(anatomy, (), flow), folder=folder, told=told)
-        tell(" ".join(done))
-    return found
-
-
-def _plan(anatomy: Anatomy, stents: Mapping[str, Sequence[Stent]], settings: FlowSettings, store: Store) -> None:
+def plan_flows(anatomy: Anatomy, stents: Mapping[str, Sequence[Stent]], settings: FlowSettings, store: Store) -> None:
     """Report run time and memory of the flows by treatment; an error is raised where one does not fit in the memory."""
     with store.stage("plan flow") as tell:
         costs = {name: foretell_cost(flow_case(anatomy, found, settings)) for name, found in stents.items()}
-        said = costs.pop(BARE)
-        tell(" ".join([said, *(f"With {name}, {cost}" for name, cost in costs.items() if cost != said)]))
+        bare = costs.pop(BARE)
+        tell(" ".join([bare, *(f"With {name}, {cost}" for name, cost in costs.items() if cost != bare)]))
 
 
 def vary_all(
@@ -424,11 +322,11 @@ def vary_all(
     store: Store,
     keys: Mapping[str, Key],
 ) -> dict[str, dict[str, Any]]:
-    """Vary the uncertain inputs of every treatment with one implant."""
+    """Return the uncertainties of every treatment with one implant, by name."""
     if settings.uncertainty is None:
         return {}
     flow = settings.flow if settings.uncertainty.flow_samples else None
-    found = {}
+    spreads = {}
     for treatment in settings.treatments:
         stage, deployed = f"vary {treatment.name}", implants.get(treatment.name, {})
         if len(deployed) > 1:
@@ -438,19 +336,17 @@ def vary_all(
         (deployment,) = deployed.values()
         varied = store.find(stage, keys[stage], Uncertainty)
         if varied is None:
+
+            def told(done: int, total: int, stage: str = stage) -> None:
+                store.progress(stage, 0.99 * done / total, f"{done} of {total}")
+
             with store.stage(stage) as tell:
-                told = partial(_tell_count, store, stage)
                 begun = store.unfinished(stage, keys[stage])
                 varied = vary(anatomy, deployment, settings.uncertainty, flow=flow, progress=told, checkpoint=begun)
                 tell(f"{len(varied.points)} deployments; {varied.n_failed} of them did not fit.")
-            store.keep(stage, keys[stage], varied)
-        found[treatment.name] = varied.metrics()
-    return found
-
-
-def _tell_count(store: Store, stage: str, done: int, total: int) -> None:
-    """Report that `done` of `total` deployments of a stage are finished."""
-    store.progress(stage, 0.99 * done / total, f"{done} of {total}")
+            store.save(stage, keys[stage], varied)
+        spreads[treatment.name] = varied.metrics()
+    return spreads
 
 
 def measure_study(
@@ -462,72 +358,42 @@ def measure_study(
     failures: Mapping[str, str],
 ) -> dict[str, Any]:
     """Return all metrics of a study: of vessel, implants and flows, with bands, uncertainties and failures."""
-    metrics = measure_all(anatomy, implants, fields, settings.flow)
-    band_all(anatomy, implants, metrics, settings)
-    for name, spread in varied.items():
-        metrics["treatments"][name]["uncertainty"] = spread
-    return metrics | ({"failures": dict(failures)} if failures else {})
-
-
-def measure_all(
-    anatomy: Anatomy,
-    implants: Mapping[str, Mapping[str, Deployment]],
-    fields: Mapping[str, FlowField],
-    settings: FlowSettings | None = None,
-) -> dict[str, Any]:
-    """Return the metrics of the vessel and of every treatment."""
     sac = anatomy.aneurysms[0] if anatomy.aneurysms else None
     shapes = (sac.sac, ostium(sac, anatomy.vessel.lumen)) if sac else ()
     treatments: dict[str, dict[str, Any]] = {BARE: {}} if fields else {}
-    for name, found in implants.items():
-        treatments[name] = {"implants": {id_: measure(anatomy, one) for id_, one in found.items()}}
-    case = flow_case(anatomy, (), settings) if fields else None
-    bare: dict[str, float] = {}
+    for name, deployed in implants.items():
+        treatments[name] = {"implants": {id_: measure(anatomy, one) for id_, one in deployed.items()}}
+    if fields:
+        case = flow_case(anatomy, (), settings.flow)
     for name, field in fields.items():
         flow = indices(field, *shapes)
+        judged = grade(case, field, flow)
         left = {"unsettled_fraction": field.unsettled_fraction} if isfinite(field.unsettled_fraction) else {}
         treatments[name]["flow"] = flow | left
         if name == BARE:
             bare = flow
         else:
             treatments[name]["change"] = ratios(bare, flow)
-        assert case is not None
-        treatments[name]["quality"] = _quality(case, field, flow)
-    return {"vessel": morphology(anatomy), "treatments": treatments}
-
-
-def band_all(
-    anatomy: Anatomy,
-    implants: Mapping[str, Mapping[str, Deployment]],
-    metrics: dict[str, Any],
-    settings: Settings,
-) -> None:
-    """Add to the metrics of every implant the bands from the ranges of its device, and how sure the device is."""
+        quality = {"grade": judged.level, "reasons": list(judged.reasons)} | judged.measures
+        treatments[name]["quality"] = quality | computation_of(case, field)
     for treatment in settings.treatments:
         for implant in treatment.implants if treatment.name in implants else ():
-            measures = metrics["treatments"][treatment.name]["implants"][implant.id]
+            measures = treatments[treatment.name]["implants"][implant.id]
             measures["bands"] = bands_of(anatomy, implants[treatment.name][implant.id], measures, implant)
+    for name, spread in varied.items():
+        treatments[name]["uncertainty"] = spread
+    metrics = {"vessel": morphology(anatomy), "treatments": treatments}
+    return metrics | ({"failures": dict(failures)} if failures else {})
 
 
 def bands_of(anatomy: Anatomy, deployment: Deployment, measures: Measures, implant: Implant) -> dict[str, Any]:
     """Return the bands that the ranges of its device give to a deployment, and how sure the device is, as metrics.
 
-    Parameters
-    ----------
-    anatomy : vessel, sacs and paths.
-    deployment : the deployed implant.
-    measures : its measures.
-    implant : size and place that were given; the band of the proposed size is added where no size was.
+    The band of the proposed size is among them where the implant has no given size.
     """
     is_proposed = implant.diameter_mm is None and implant.length_mm is None
     found = bands(anatomy, deployment, measures, is_proposed=is_proposed)
     return found.metrics() | {"device": how_sure(deployment.stent.design)}
-
-
-def _quality(case: FlowCase, field: FlowField, found: Mapping[str, float]) -> dict[str, Any]:
-    """Return the grade of a flow, its reasons, and what was computed."""
-    judged = grade(case, field, found)
-    return {"grade": judged.level, "reasons": list(judged.reasons)} | judged.measures | computation_of(case, field)
 
 
 def _array(points_mm: Point | tuple[Point, ...] | None) -> Floats | None:

@@ -14,8 +14,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
-from functools import partial
-from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
@@ -25,10 +23,9 @@ from vstent.io.states import states_of
 from vstent.study.progress import OnProgress, Progress
 
 if TYPE_CHECKING:
-    from vstent.flow.engines import Progress as FlowProgress
     from vstent.flow.engines import Saved
 
-Kept = TypeVar("Kept")
+Result = TypeVar("Result")
 KEY_DIGITS: Final = 12
 """Number of hexadecimal digits of each part of a key."""
 UNREADABLE: Final = (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError)
@@ -71,25 +68,18 @@ def silent(progress: Progress) -> None:
 class Store:
     """Measures the time of the stages, reports their progress, and stores and finds their results.
 
-    Every result has a name and a key. It is a data class of vstent, or plain values.
-
-    Parameters
-    ----------
-    folder : cache folder of the case.
-    progress : called at every stage.
+    `folder` is the cache folder of the case. Every result has a name and a key. It is a data class, or plain values.
     """
 
     def __init__(self, folder: Path, progress: OnProgress = silent) -> None:
-        self.folder, self._watch = folder, progress
+        self.folder, self._report = folder, progress
         self.seconds: dict[str, float] = {}
-        self._held: list[tuple[str, Callable[[], None]]] = []
+        self._deferred: dict[str, Callable[[], None]] = {}
         self._before: dict[str, set[str]] = {}
-
-    # -- stages --------------------------------------------------------------------------------------------------------
 
     def progress(self, stage: str, fraction: float, detail: str, **more: Any) -> None:
         """Report the progress of a stage; the arguments are the fields of a `Progress`."""
-        self._watch(Progress(stage, fraction, detail, **more))
+        self._report(Progress(stage, fraction, detail, **more))
 
     @contextmanager
     def stage(self, name: str) -> Iterator[Callable[[str], None]]:
@@ -97,64 +87,47 @@ class Store:
 
         The yielded function takes a sentence on the result.
         """
-        found: list[str] = []
+        sentences: list[str] = []
         self.progress(name, 0.0, "")
         began = time.perf_counter()
-        yield found.append
+        yield sentences.append
         self.seconds[name] = time.perf_counter() - began
-        self.progress(name, 1.0, " ".join(found))
-
-    def teller(self, name: str) -> "Callable[[FlowProgress], None]":
-        """Return a function that reports the progress of a flow under a stage name."""
-
-        def tell(progress: "FlowProgress") -> None:
-            residual = progress.residual if isfinite(progress.residual) else None
-            left_s = progress.seconds_left
-            self.progress(name, min(progress.fraction, 0.99), "", residual=residual, seconds_left=left_s)
-
-        return tell
+        self.progress(name, 1.0, " ".join(sentences))
 
     def foretell(self, keys: Mapping[str, Key]) -> None:
         """Report in one sentence which results were computed by other code, and how long computing them again takes."""
-        seconds: dict[str, float] = {}
-        names = []
+        seconds: dict[str, dict[str, float]] = {}
         for name, key in keys.items():
-            former = None if self.record(name, key) else self._by_other_code(name, key)
-            if former:
-                seconds |= former["seconds"]
-                names.append(name)
-        if names:
+            if not self.record(name, key):
+                for file in self._files(name):
+                    given, code = file.name.removeprefix(f"{name}-").partition(".")[0].split("-")[:2]
+                    record = self.record(name, Key(given, code)) if given == key.given else {}
+                    if record:
+                        seconds[name] = record["seconds"]
+        if seconds:
+            total_s = sum({stage: took for stages in seconds.values() for stage, took in stages.items()}.values())
             self.progress(
                 "stored results",
                 1.0,
-                f"computed with other code: {', '.join(names)}; computing them again takes about "
-                f"{max(1.0, sum(seconds.values())):.0f} s, and they are kept until then.",
+                f"computed with other code: {', '.join(seconds)}; computing them again takes about "
+                f"{max(1.0, total_s):.0f} s, and they are kept until then.",
             )
-
-    def _by_other_code(self, name: str, key: Key) -> dict[str, Any]:
-        """Return the record of a result that other code has computed from the same; empty where there is none."""
-        for file in self._files(name):
-            given, code = file.name.removeprefix(f"{name}-").partition(".")[0].split("-")[:2]
-            record = self.record(name, Key(given, code)) if given == key.given else {}
-            if record:
-                return record
-        return {}
 
     # -- data classes --------------------------------------------------------------------------------------------------
 
-    def find(self, name: str, key: Key, kind: type[Kept]) -> Kept | None:
+    def find(self, name: str, key: Key, kind: type[Result]) -> Result | None:
         """Return the result stored under a key, report it and add its run time; None where it is missing or damaged."""
         self._before[name] = set(self.seconds)
         record = self.record(name, key)
         if not record:
             return None
         self.progress(name, 0.0, "")
-        result = self.peek(name, key, kind)
+        result = self.load(name, key, kind)
         if result is not None:
             self._tell_done(name, record)
         return result
 
-    def peek(self, name: str, key: Key, kind: type[Kept]) -> Kept | None:
+    def load(self, name: str, key: Key, kind: type[Result]) -> Result | None:
         """Return the result stored under a key, without a report of it; None where it is missing or damaged."""
         from vstent.io.archive import load_data
 
@@ -162,48 +135,42 @@ class Store:
             return load_data(self.path(name, key), kind) if self.record(name, key) else None
         return None
 
-    def hold(self, name: str, key: Key, result: Any) -> None:
-        """Keep a result in memory until `settle` is called, because a later input may still prove unusable."""
-        self._held.append((name, self.keeping(name, key, result)))
-
-    def is_held(self, name: str) -> bool:
-        """Return whether a result of this name is in memory and not stored yet."""
-        return any(held == name for held, _ in self._held)
-
-    def settle(self) -> None:
-        """Store all results kept in memory; from here on files are written."""
-        for _, keep in self._held:
-            keep()
-        self._held.clear()
-
-    def keep(self, name: str, key: Key, result: Any) -> None:
+    def save(self, name: str, key: Key, result: Any) -> None:
         """Store a result under a key; older results of the same name are deleted after that."""
-        self.keeping(name, key, result)()
+        self.saver(name, key, result)()
 
-    def keeping(self, name: str, key: Key, result: Any) -> Callable[[], None]:
-        """Return a function that does what `keep` does, with the run times of the stages until now."""
-        since = {stage: took for stage, took in self.seconds.items() if stage not in self._before.get(name, ())}
-        return partial(self._keep, name, key, result, since)
+    def saver(self, name: str, key: Key, result: Any) -> Callable[[], None]:
+        """Return a function that does what `save` does, with the run times of the stages until now."""
+        seconds = {stage: took for stage, took in self.seconds.items() if stage not in self._before.get(name, ())}
 
-    def _keep(self, name: str, key: Key, result: Any, seconds: dict[str, float]) -> None:
-        """Store a result with the run times of its stages."""
-        from vstent.io.archive import save_data
+        def save() -> None:
+            from vstent.io.archive import save_data
 
-        save_data(self.path(name, key), result)
-        self.write(name, key, seconds)
+            save_data(self.path(name, key), result)
+            self.write(name, key, seconds)
+
+        return save
+
+    def defer(self, name: str, key: Key, result: Any) -> None:
+        """Store a result when `save_deferred` is called, because a later input may still prove unusable."""
+        self._deferred[name] = self.saver(name, key, result)
+
+    def is_deferred(self, name: str) -> bool:
+        """Return whether a result of this name is in memory and not stored yet."""
+        return name in self._deferred
+
+    def save_deferred(self) -> None:
+        """Store all deferred results; from here on files are written."""
+        for save in self._deferred.values():
+            save()
+        self._deferred.clear()
 
     # -- files and plain values ----------------------------------------------------------------------------------------
 
     def write_once(self, name: str, key: Key, folder: Path, files: Iterable[str], write: Callable[[], str]) -> None:
         """Write the files of a stage unless they are there, unchanged since they were written under this key.
 
-        Parameters
-        ----------
-        name : name of the stage.
-        key : key of the files.
-        folder : folder of the files.
-        files : names of the files.
-        write : writes them and returns a sentence.
+        `write` writes the `files` of the folder and returns a sentence.
         """
         record = self.record(name, key)
         if record and record.get("files") == states_of(folder, files):
@@ -224,8 +191,6 @@ class Store:
         self.write(name, key, {name: self.seconds[name]}, values=values)
         return values
 
-    # -- unfinished runs -----------------------------------------------------------------------------------------------
-
     def unfinished(self, name: str, key: Key) -> "Unfinished":
         """Return the saved states of the runs of an unfinished result; they are deleted when the result is stored."""
         return Unfinished(self.folder, f"{name}-{key}")
@@ -244,14 +209,9 @@ class Store:
         return {}
 
     def write(self, name: str, key: Key, seconds: Mapping[str, float], **more: Any) -> None:
-        """Write the record of a result, which is complete with it, and delete older results of the same name.
+        """Write the record of a result, with which it is complete, and delete older results of the same name.
 
-        Parameters
-        ----------
-        name : name of the result.
-        key : key of the result.
-        seconds : run time in s of every stage that it took.
-        more : values, or states of files.
+        It states the run time of every stage that the result took, and values or states of files.
         """
         with atomic(self.path(name, key, ".json")) as partial_file:
             partial_file.write_text(json.dumps({"seconds": seconds} | more), encoding="utf-8")
@@ -275,13 +235,7 @@ class Store:
 
 
 class Unfinished:
-    """Saved states of the runs of one unfinished computation, one file per run (`vstent.flow.simulation.Checkpoint`).
-
-    Parameters
-    ----------
-    folder : cache folder of the case.
-    stem : begin of the names of the files.
-    """
+    """Saved states of the runs of an unfinished computation, one file per run (`vstent.flow.simulation.Checkpoint`)."""
 
     def __init__(self, folder: Path, stem: str) -> None:
         self._folder, self._stem = folder, stem

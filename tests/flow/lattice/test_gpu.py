@@ -21,8 +21,8 @@ from vstent.errors import FlowError, InputError
 from vstent.flow import domain
 from vstent.flow.case import FlowCase, Sheet
 from vstent.flow.lattice import gpu as gpus
-from vstent.flow.lattice import stepping
 from vstent.flow.lattice import state as lattice_state
+from vstent.flow.lattice import stepping
 from vstent.flow.lattice.checkpoint import pack
 from vstent.flow.lattice.cost import GPU_BYTES_PER_CELL, estimate, refuse_too_large
 from vstent.flow.lattice.engine import LatticeBoltzmann
@@ -35,7 +35,7 @@ from vstent.flow.settings import Blood, CarreauYasuda, FlowSettings, Numerics, W
 from vstent.flow.simulation import engine_class, foretell_cost, simulate_case
 from vstent.kernels.directions import VELOCITIES
 from vstent.study import repeat
-from vstent.study.provenance import machine, provenance
+from vstent.study.repeat import provenance
 from vstent.study.settings import Settings
 
 CELL_MM, RADIUS_MM, LENGTH_MM = 0.4, 0.7, 0.8
@@ -393,14 +393,13 @@ def test_what_does_not_fit_in_the_gpus_memory_is_refused_with_the_cell_size_that
 
 
 def test_a_record_keeps_that_a_run_was_on_a_gpu_and_on_which(monkeypatch: pytest.MonkeyPatch) -> None:
-    module = sys.modules["vstent.study.provenance"]  # its function goes by the same name
     with monkeypatch.context() as on_gpu:
-        on_gpu.setattr(module, "gpu_name", lambda: "A100")
+        on_gpu.setattr(repeat, "gpu_name", lambda: "A100")
         told = provenance(Path("a.stl"), "0", Settings(flow=ASKED))
     assert told["machine"]["gpu"] == "A100"
     again = repeat.settings_of(json.loads(json.dumps(told["settings"])))
     assert again.flow is not None
     assert again.flow.numerics.device_gpu
     monkeypatch.setattr(gpus, "find_spec", lambda name: None)
-    assert "gpu (machine): A100 before, none now" in repeat._differences(told, again)
-    assert "gpu" not in machine(Settings())
+    assert "gpu (machine): A100 before, none now" in repeat.differences(told, again)
+    assert "gpu" not in provenance(Path("a.stl"), "0", Settings())["machine"]

@@ -24,7 +24,8 @@ SPARE: Final = 2.0
 """Factor on the estimated memory that a Slurm job requests, because a job that exceeds its request is killed."""
 SCHEDULER_S: Final = 20.0
 """Time to wait for a Dask scheduler to answer, in s."""
-
+MISSING: Final = "{} is not installed: run pip install 'vstent[cluster]', or work without the cluster"
+"""Message where a package is not installed."""
 _ALONE: Final = threading.Lock()
 """Lock for parallel kernels, which allow one caller per process; a Dask worker may have several threads."""
 
@@ -48,23 +49,17 @@ class Ended(NamedTuple):
     """Reason why its process died; empty where it finished."""
 
 
-class AbstractCrew(ABC):
+class AbstractWorkers(ABC):
     """Runs tasks in parallel. Every task writes its own results, so that they survive the main process."""
 
     @abstractmethod
     def do(self, work: Callable[[Task], None], tasks: Sequence[Task]) -> Iterator[Ended]:
-        """Run tasks; yield each one when it has ended, in any order.
-
-        Parameters
-        ----------
-        work : function at the top level of a module that does a task.
-        tasks : the tasks.
-        """
+        """Run tasks; yield each one when it has ended, in any order. `work` is at the top level of a module."""
 
 
 @final
 @dataclass(frozen=True)
-class Processes(AbstractCrew):
+class Processes(AbstractWorkers):
     """Processes of this machine, a new one for every task, so that a crash affects one task only."""
 
     jobs: int
@@ -83,18 +78,22 @@ class Processes(AbstractCrew):
                     with spawning():
                         process.start()
                     running.append((process, number, attempt))
-                wait([one.sentinel for one, _, _ in running])
+                wait([process.sentinel for process, _, _ in running])
                 for ended in [one for one in running if one[0].exitcode is not None]:
                     running.remove(ended)
-                    code, number, attempt = ended[0].exitcode, *ended[1:]
+                    code, number, attempt = ended[0].exitcode or 0, *ended[1:]
+                    how = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
                     if code and attempt < ATTEMPTS:
                         waiting.append((number, attempt + 1))
+                    elif code:
+                        advice = "it may be out of memory. Use fewer jobs and run the same command again."
+                        yield Ended(number, f"Its process {how} {ATTEMPTS} times; {advice}")
                     else:
-                        yield Ended(number, _fault(code))
+                        yield Ended(number, "")
         finally:
-            for one, _, _ in running:
-                one.terminate()
-                one.join()
+            for process, _, _ in running:
+                process.terminate()
+                process.join()
 
 
 def _uninterrupted(work: Callable[[Task], None], task: Task) -> None:
@@ -103,19 +102,9 @@ def _uninterrupted(work: Callable[[Task], None], task: Task) -> None:
     work(task)
 
 
-def _fault(exitcode: int | None) -> str:
-    """Return the reason why a process died, from its exit code; empty where it finished."""
-    if not exitcode:
-        return ""
-    how = f"was killed by signal {-exitcode}" if exitcode < 0 else f"ended with code {exitcode}"
-    return (
-        f"Its process {how} {ATTEMPTS} times; it may be out of memory. Use fewer jobs and run the same command again."
-    )
-
-
 @final
 @dataclass(frozen=True)
-class DaskCluster(AbstractCrew):
+class DaskCluster(AbstractWorkers):
     """Workers of a Dask cluster; they must have access to the same folders as this machine."""
 
     address: str
@@ -131,18 +120,36 @@ class DaskCluster(AbstractCrew):
         VstentError
             The connection to the scheduler is lost; finished tasks are kept.
         """
-        with _client(self.address) as client:
+        try:
+            from distributed import Client
+        except ImportError:
+            raise InputError(MISSING.format("Dask")) from None
+        try:
+            client = Client(self.address, timeout=SCHEDULER_S)
+        except (OSError, ValueError) as error:
+            raise InputError(f"No Dask scheduler answers at {self.address}: start one with `dask scheduler`") from error
+        with client:
             futures = {client.submit(work, task, pure=False): number for number, task in enumerate(tasks)}
             while futures:
-                _see_alive(client)
-                for future in [future for future in futures if future.done()]:
-                    yield Ended(futures.pop(future), _future_fault(future))
+                done = [future for future in futures if future.done()]
+                is_lost = client.status not in ("running", "connecting")
+                if is_lost or any(future.status not in ("finished", "error") for future in done):
+                    raise VstentError(
+                        "the Dask scheduler was lost; finished results are kept: start it again and give the same "
+                        "command"
+                    )
+                for future in done:
+                    fault = ""
+                    if future.status == "error":
+                        advice = "Check the workers' logs and run the same command again."
+                        fault = f"Its worker failed: {future.exception()}. {advice}"
+                    yield Ended(futures.pop(future), fault)
                 time.sleep(0.1)
 
 
 @final
 @dataclass(frozen=True)
-class Slurm(AbstractCrew):
+class Slurm(AbstractWorkers):
     """Jobs of a Slurm queue, each a Dask worker; they are started for these tasks and ended with them."""
 
     jobs: int
@@ -151,13 +158,7 @@ class Slurm(AbstractCrew):
     """Estimated memory of one task."""
 
     def do(self, work: Callable[[Task], None], tasks: Sequence[Task]) -> Iterator[Ended]:
-        """Run tasks; yield each one when it has ended.
-
-        Raises
-        ------
-        InputError
-            dask-jobqueue is not installed, or Slurm is not available.
-        """
+        """Run tasks; yield each one when it has ended; InputError where dask-jobqueue or Slurm is missing."""
         if shutil.which("sbatch") is None:  # dask-jobqueue would try to submit jobs forever
             raise InputError(
                 "Slurm was not found (no `sbatch` on the PATH): run the command on a machine that submits jobs"
@@ -171,42 +172,6 @@ class Slurm(AbstractCrew):
         try:
             from dask_jobqueue import SLURMCluster
         except ImportError:
-            raise _missing("dask-jobqueue") from None
+            raise InputError(MISSING.format("dask-jobqueue")) from None
         memory, prologue = f"{SPARE * self.memory_MB:.0f}MB", [f"export {name}={value}" for name, value in SAFE.items()]
         return SLURMCluster(cores=1, processes=1, memory=memory, job_name="vstent", job_script_prologue=prologue)
-
-
-def _missing(package: str) -> InputError:
-    """Return the error for a package that is not installed."""
-    return InputError(f"{package} is not installed: run pip install 'vstent[cluster]', or work without the cluster")
-
-
-def _client(address: str) -> Any:
-    """Return a client of the Dask scheduler at an address."""
-    try:
-        from distributed import Client
-    except ImportError:
-        raise _missing("Dask") from None
-    try:
-        return Client(address, timeout=SCHEDULER_S)
-    except (OSError, ValueError) as error:
-        raise InputError(f"No Dask scheduler answers at {address}: start one with `dask scheduler`") from error
-
-
-def _see_alive(client: Any) -> None:
-    """Raise VstentError where the connection to the scheduler is lost."""
-    if client.status not in ("running", "connecting"):
-        raise VstentError(
-            "the Dask scheduler was lost; finished results are kept: start it again and give the same command"
-        )
-
-
-def _future_fault(future: Any) -> str:
-    """Return the reason why a task failed; empty where it finished."""
-    if future.status == "finished":
-        return ""
-    if future.status == "error":
-        return f"Its worker failed: {future.exception()}. Check the workers' logs and run the same command again."
-    raise VstentError(
-        "the Dask scheduler was lost; finished results are kept: start it again and give the same command"
-    )

@@ -1,12 +1,13 @@
-"""Compute the flows of a ranking in parallel: in processes of this machine, on a Dask cluster, or in a Slurm queue."""
+"""Store the flows of a ranking, and compute them in parallel: in processes, on a Dask cluster, or in a Slurm queue."""
 
 import pickle
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
+from vstent.devices.treatment import BARE
 from vstent.flow.case import FlowField
 from vstent.flow.memory import free_memory_bytes
 from vstent.flow.problem import flow_case
@@ -16,8 +17,10 @@ from vstent.geometry.vessel import Anatomy
 from vstent.io.files import atomic
 from vstent.plan.rank import Candidate
 from vstent.plan.rank_flow import coverage_of, flow_with, is_finished, nearest, stent_of
-from vstent.study.crews import AbstractCrew, alone
-from vstent.study.flow_store import FlowStore
+from vstent.study.folder import CACHE
+from vstent.study.keys import key_of
+from vstent.study.store import Key, Store
+from vstent.study.workers import AbstractWorkers, alone
 from vstent.units import BYTES_PER_MB
 
 COMMON: Final = "common"
@@ -25,7 +28,39 @@ COMMON: Final = "common"
 FIELD: Final = ".flow"
 """Suffix of the file of a finished flow, from which others start."""
 RESULT: Final = ".result"
-"""Suffix of the file of what the ranking keeps of a flow."""
+"""Suffix of the file of what the ranking needs of a flow."""
+
+
+class FlowStore:
+    """Results of flows by candidate (None: without a device), in the store of a case folder.
+
+    `anatomy` is the key of the artery. With them an interrupted ranking resumes.
+    """
+
+    def __init__(self, out: Path, anatomy: Key, settings: FlowSettings) -> None:
+        self.folder = out / CACHE
+        self._store, self._anatomy, self._settings = Store(self.folder), anatomy, settings
+        self._lost: dict[str, Any] = {}
+
+    def get(self, candidate: Candidate | None) -> Mapping[str, Any] | None:
+        """Return the result with a candidate, or None if there is none of these numbers."""
+        name, key = self._place(candidate)
+        return self._lost.get(name, self._store.record(name, key).get("values"))
+
+    def __setitem__(self, candidate: Candidate | None, result: Mapping[str, Any]) -> None:
+        self._store.write(*self._place(candidate), {}, values=dict(result))
+
+    def lose(self, candidate: Candidate, why: str) -> None:
+        """Remember, for this run only, that a flow was lost with the process that computed it."""
+        self._lost[self._place(candidate)[0]] = {"error": why}
+
+    def _place(self, candidate: Candidate | None) -> tuple[str, Key]:
+        """Return the name of a result in the store and its key."""
+        name, device = f"rank flow {BARE}", None
+        if candidate is not None:
+            name = f"rank flow {candidate.design.key} {candidate.size.label} {candidate.shift_mm:+g}"
+            device = replace(candidate.design, facts=(), ranges=()), candidate.size, candidate.shift_mm
+        return name, key_of("vstent.plan.rank_flow", self._anatomy, self._settings, device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +96,7 @@ def compute_missing(
     chosen: Sequence[Candidate],
     settings: FlowSettings,
     stored: FlowStore,
-    crew: AbstractCrew,
+    workers: AbstractWorkers,
     *,
     has_contrast: bool = False,
     threads: int = 1,
@@ -69,18 +104,9 @@ def compute_missing(
 ) -> None:
     """Compute the missing flows of a ranking in parallel and store their results for `rank_flows`.
 
-    Every flow starts from the most similar one that is finished when it begins, as in `rank_flows`.
-
-    Parameters
-    ----------
-    anatomy : the restored artery, with a sac.
-    chosen : candidates that get a flow, of `chosen_of`.
-    settings : settings of the flows.
-    stored : finished results; new ones are added.
-    crew : processes or cluster that compute the flows with a device; the one without is computed here.
-    has_contrast : whether the retention of contrast is measured.
-    threads : number of threads of each flow.
-    progress : called with the number of finished flows, the number of all, and the name of the last.
+    The artery has a sac, and the candidates are those of `chosen_of`. Every flow starts from the most similar one that
+    is finished when it begins, as in `rank_flows`; the one without a device is computed here. `progress` gets the
+    number of finished flows, the number of all, and the name of the last.
 
     Raises
     ------
@@ -103,20 +129,20 @@ def compute_missing(
     progress(before, total, f"{len(wanted)} devices in parallel")
     with TemporaryDirectory(prefix="rank-flow-", dir=stored.folder) as name:
         folder = Path(name)
-        _keep(folder / COMMON, Common(anatomy, settings, wanted, bare, has_contrast, threads))
+        write_pickle(folder / COMMON, Common(anatomy, settings, wanted, bare, has_contrast, threads))
         tasks = [FlowTask(folder, number) for number in range(len(wanted))]
-        for done, ended in enumerate(crew.do(work, tasks), start=1):
+        for done, ended in enumerate(workers.do(work, tasks), start=1):
             candidate = wanted[ended.number]
             if ended.fault:
                 stored.lose(candidate, ended.fault)
             else:
-                stored[candidate] = _kept(folder / f"{ended.number}{RESULT}")
+                stored[candidate] = _read_pickle(folder / f"{ended.number}{RESULT}")
             progress(before + done, total, candidate.label)
 
 
 def work(task: FlowTask) -> None:
-    """Compute the flow with one candidate, and keep it and its result in the folder of the task."""
-    common: Common = _kept(task.folder / COMMON)
+    """Compute the flow with one candidate, and write it and its result into the folder of the task."""
+    common: Common = _read_pickle(task.folder / COMMON)
     with alone(common.threads):
         candidate = common.candidates[task.number]
         paths = ((coverage_of(one), task.folder / f"{n}{FIELD}") for n, one in enumerate(common.candidates))
@@ -126,41 +152,36 @@ def work(task: FlowTask) -> None:
             candidate,
             common.settings,
             start=common.bare,
-            similar=None if similar is None else _kept(similar),
+            similar=None if similar is None else _read_pickle(similar),
             has_contrast=common.has_contrast,
         )
         if field is not None:
-            _keep(task.folder / f"{task.number}{FIELD}", field)
-        _keep(task.folder / f"{task.number}{RESULT}", measured())
+            write_pickle(task.folder / f"{task.number}{FIELD}", field)
+        write_pickle(task.folder / f"{task.number}{RESULT}", measured())
 
 
 def parallel_flows(
     anatomy: Anatomy, chosen: Sequence[Candidate], settings: FlowSettings, jobs: int
 ) -> tuple[int, float]:
-    """Return how many flows fit beside each other on this machine, at most `jobs`, and the memory of one, in MB.
+    """Return how many flows fit in memory at once on this machine, at most `jobs`, and the memory of one, in MB.
 
     One at a time where they run on a GPU, or where the memory of a flow is unknown (0 is returned for it).
     """
-    needed = _memory_bytes(anatomy, chosen, settings)
+    needed = 0.0
+    if chosen and anatomy.aneurysms:
+        needed = memory_bytes(flow_case(anatomy, (stent_of(anatomy, chosen[0]),), settings)) or 0.0
     if settings.numerics.device_gpu or not needed:
         return 1, needed / BYTES_PER_MB
     fitting = min(jobs // settings.numerics.processes, free_memory_bytes() // needed)
     return max(1, int(fitting)), needed / BYTES_PER_MB
 
 
-def _memory_bytes(anatomy: Anatomy, chosen: Sequence[Candidate], settings: FlowSettings) -> float:
-    """Return the memory of the flow with the first candidate; 0 where it is unknown or there is none."""
-    if not chosen or not anatomy.aneurysms:
-        return 0.0
-    return memory_bytes(flow_case(anatomy, (stent_of(anatomy, chosen[0]),), settings)) or 0.0
-
-
-def _keep(path: Path, what: Any) -> None:
+def write_pickle(path: Path, what: Any) -> None:
     """Write an object, so that a file of this name is always whole."""
     with atomic(path) as partial:
         partial.write_bytes(pickle.dumps(what))
 
 
-def _kept(path: Path) -> Any:
+def _read_pickle(path: Path) -> Any:
     """Return an object that this module has written."""
     return pickle.loads(path.read_bytes())

@@ -13,12 +13,11 @@ from vstent.flow.settings import FlowSettings, Numerics
 from vstent.io.writers import write_stl
 from vstent.plan.rank import Ranking, rank
 from vstent.plan.rank_flow import chosen_of, coverage_of, is_similar, rank_flows
-from vstent.study import flow_crew
-from vstent.study.crews import Processes
-from vstent.study.flow_crew import Common, FlowTask, compute_missing, parallel_flows
-from vstent.study.flow_store import FlowStore
+from vstent.study import ranking_flows
 from vstent.study.folder import CACHE
+from vstent.study.ranking_flows import Common, FlowStore, FlowTask, compute_missing, parallel_flows
 from vstent.study.store import Key
+from vstent.study.workers import Processes
 
 SETTINGS = FlowSettings(inflow_mL_s=1.5, numerics=Numerics(cells_per_diameter=8.0, tolerance=0.05))
 
@@ -31,14 +30,14 @@ def ranking() -> Ranking:
 def killed(task: FlowTask) -> None:
     if task.number == 1:
         os.kill(os.getpid(), signal.SIGKILL)
-    flow_crew.work(task)
+    ranking_flows.work(task)
 
 
 def test_a_killed_process_loses_one_flow_and_the_next_run_gives_the_bits_of_one_after_the_other(tmp_path, monkeypatch):
     (tmp_path / CACHE).mkdir()
     chosen, told = chosen_of(ranking(), 2), []
     assert not is_similar(*(coverage_of(one) for one in chosen))  # both start from the flow without a device
-    monkeypatch.setattr(flow_crew, "work", killed)
+    monkeypatch.setattr(ranking_flows, "work", killed)
     store = FlowStore(tmp_path, Key("anatomy", "code"), SETTINGS)
     compute_missing(anatomy(), chosen, SETTINGS, store, Processes(2), progress=lambda *one: told.append(one[:2]))
     assert [done for done, _ in told] == [0, 1, 2, 3]
@@ -60,13 +59,13 @@ def test_a_flow_starts_from_the_most_similar_one_that_is_finished(tmp_path, monk
         begun.append((candidate.covers, start, similar, has_contrast))
         return (None if candidate.covers == 0.31 else f"flow {candidate.covers}", dict)
 
-    monkeypatch.setattr(flow_crew, "flow_with", noting)
-    monkeypatch.setattr(flow_crew, "coverage_of", lambda candidate: candidate.covers)
+    monkeypatch.setattr(ranking_flows, "flow_with", noting)
+    monkeypatch.setattr(ranking_flows, "coverage_of", lambda candidate: candidate.covers)
     candidates = tuple(SimpleNamespace(covers=one) for one in covered)
     common = Common("anatomy", "settings", candidates, "bare", has_contrast=True, threads=1)
-    flow_crew._keep(tmp_path / flow_crew.COMMON, common)
+    ranking_flows.write_pickle(tmp_path / ranking_flows.COMMON, common)
     for number in (0, 1, 3, 2):
-        flow_crew.work(FlowTask(tmp_path, number))
+        ranking_flows.work(FlowTask(tmp_path, number))
     similar = [None, None, "flow 0.3", "flow 0.3"]  # 0.31, which is nearer to 0.32, has failed
     assert begun == [(covered[n], "bare", found, True) for n, found in zip((0, 1, 3, 2), similar, strict=True)]
 
@@ -76,7 +75,7 @@ def test_as_many_flows_as_fit_in_memory_run_beside_each_other(monkeypatch):
     _, needed_MB = parallel_flows(anatomy(), chosen, SETTINGS, 2)
     assert needed_MB > 450  # the program itself
     for free, jobs, wanted in ((3.5, 8, 3), (3.5, 2, 2), (0.5, 8, 1)):
-        monkeypatch.setattr(flow_crew, "free_memory_bytes", lambda free=free: free * needed_MB * 1e6)
+        monkeypatch.setattr(ranking_flows, "free_memory_bytes", lambda free=free: free * needed_MB * 1e6)
         assert parallel_flows(anatomy(), chosen, SETTINGS, jobs)[0] == wanted
     on_gpu = FlowSettings(numerics=Numerics(cells_per_diameter=8.0, device_gpu=True))
     assert parallel_flows(anatomy(), chosen, on_gpu, 8)[0] == 1
