@@ -40,14 +40,14 @@ from vstent.geometry.vessel import Anatomy, Opening
 from vstent.io.archive import load_data
 from vstent.kernels import clipping
 from vstent.kernels.arrays import Floats
-from vstent.reporting import bands as words
 from vstent.reporting.packing import message
 from vstent.reporting.scene import (
+    STEEL_COLOUR,
     LineLayer,
     MeshLayer,
     View,
     anatomy_layers,
-    device_layers,
+    contour_layer,
     flow_layers,
     implant_titles,
     node_coverage,
@@ -56,6 +56,7 @@ from vstent.reporting.scene import (
     view_of,
     views_of,
 )
+from vstent.reporting.uncertainty import band_rows, how_sure
 from vstent.study.folder import CACHE
 from vstent.study.stages import bands_of, deploy_implant, landing_of, on_path, size_of
 
@@ -209,7 +210,7 @@ class Live:
 
     def _drawn(self, pane: str, treatment: Treatment, colour: Colour) -> list[MeshLayer | LineLayer]:
         """Return wires and contours of a deployed treatment in a pane."""
-        contours = [device_layers(pane, one, self.anatomy)[0] for one in self.deployed(treatment).values()]
+        contours = [contour_layer(pane, one, self.anatomy) for one in self.deployed(treatment).values()]
         return [*self._wires(pane, treatment, colour), *contours]
 
     def _sheets(self, treatment: Treatment) -> list[dict[str, Any]]:
@@ -222,7 +223,7 @@ class Live:
         with LOCK:
             metrics = self.metrics(treatment, _one(treatment, implant))
         told = {"treatment": treatment.name, "implant": implant}
-        return told | {"sentence": words.how_sure(metrics), "rows": words.rows(metrics)}
+        return told | {"sentence": how_sure(metrics), "rows": band_rows(metrics)}
 
     def follow(self, take: Callable[[tuple[Stent, ...]], None] | None) -> None:
         """Hand the devices that are drawn, and all later ones, to the live flow; None: to nobody."""
@@ -512,8 +513,7 @@ def _disc(number: int, opening: Opening) -> MeshLayer:
     around = np.arange(40)
     faces = np.stack([np.zeros(40, int), 1 + around, 1 + (around + 1) % 40], axis=1)
     surface = Surface(points, faces)
-    nothing = np.zeros(0)
-    return MeshLayer(f"opening {number}", "", _opening_colour(opening), "", nothing, surface)
+    return MeshLayer(f"opening {number}", "", _opening_colour(opening), surface)
 
 
 def _neck_span(anatomy: Anatomy) -> list[float]:
@@ -536,12 +536,12 @@ def _wires(name: str, stent: Stent, gap_mm: Floats, colour: Colour, coverage: Ca
     return LineLayer(
         "wires",
         name,
-        (0.33, 0.38, 0.43),
-        colour,
-        values,
+        STEEL_COLOUR,
         stent.wire_points_mm,
         stent.wire_starts,
         stent.wire_diameter_um / 2000,
+        scale=colour,
+        values=values,
     )
 
 

@@ -147,7 +147,7 @@ class Scan:
         if len(faces):
             index, faces = _without_specks(index, faces)
             surface = thin_surface(Surface(self.part.to_mm(stride * index), faces), LIVE_FACES)[0]
-            layers = [MeshLayer("live", "", (0.80, 0.62, 0.55), "", np.zeros(0), surface)]
+            layers = [MeshLayer("live", "", (0.80, 0.62, 0.55), surface)]
             views = [view_of("whole", FRONTAL, surface.vertices_mm)]
         return message(layers, views=views, threshold=threshold)
 

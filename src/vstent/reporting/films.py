@@ -18,9 +18,8 @@ from vstent.io.films import write_animation, write_frames
 from vstent.io.writers import write_json
 from vstent.io.xa_writer import BITS, XaHeader, write_xa
 from vstent.kernels.arrays import Floats
-from vstent.reporting.figures import Picture
+from vstent.reporting.figures import Picture, image_of
 from vstent.reporting.lettering import blank, font, put_title
-from vstent.reporting.plots import image_of
 from vstent.study.contrast import FOLDER
 
 ANIMATION: Final = "angiogram.webp"
