@@ -169,10 +169,10 @@ _OF_FLOW = (
 """Layer that a picture of the flow shows, all its layers, its title and its caption."""
 
 
-def wire_shots(scene: Scene, pane: str) -> list[Shot]:
-    """Return the wires of a treatment in profile and, where there is one, seen from the sac."""
+def wire_shots(scene: Scene, pane: str, *more: str) -> list[Shot]:
+    """Return the wires of a treatment in profile, with `more` layers, and from the sac where there is one."""
     looks = {
-        "profile": ("In profile", ("lumen", "continued", "wires", "neck")),
+        "profile": ("In profile", ("lumen", "continued", "wires", "neck", *more)),
         "neck": ("Seen from the sac", ("wires", "neck")),
     }
     return [

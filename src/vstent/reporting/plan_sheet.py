@@ -112,7 +112,7 @@ def _picture(case: Planned, name: str) -> Picture:
     """Return a treatment in profile and seen from the sac."""
     scene = scene_of(case.anatomy, {name: case.implants[name]}, {})
     caption = "The device in the patient's artery; the red line is the neck."
-    return Plate("plan", "Position", caption, scene, wire_shots(scene, name)).drawn()
+    return Plate("plan", "Position", caption, scene, wire_shots(scene, name, "sac")).drawn()
 
 
 def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
