@@ -4,7 +4,7 @@ Usage: python benchmarks/live.py [--vessel NAME ...] [--device NAME ...] [--refe
 
 Every device begins with a new live flow; its first number is the first whose band the page shows. Without
 `--reference` only the preview is run. With it every flow is also computed on the default grid (minutes each). The last
-line gives the largest difference, which `vstent.app.preview.ERROR_POINTS` states on the page.
+line gives the largest difference, which `vstent.app.live.ERROR_POINTS` states on the page.
 
 `--switch` measures instead what a user of the page waits for, in a process as the page starts it: the time from the
 switch to the first number with a band, with nothing prepared, with the flow without a device prepared, and with that
@@ -20,7 +20,7 @@ from time import perf_counter, sleep
 from grades import SPACINGS_MM, anatomy_of
 
 import vstent
-from vstent.app.preview import ERROR_POINTS, SHOWN_POINTS, Preview, shelf_of
+from vstent.app.live import ERROR_POINTS, SHOWN_POINTS, BareFlowStore, LiveFlowProcess
 from vstent.devices.stent import Landing, Stent
 from vstent.flow.indices import indices
 from vstent.flow.lattice.live import LiveFlow
@@ -89,13 +89,13 @@ def full(anatomy: Anatomy, stents: dict[str, Stent]) -> dict[str, float]:
     return found
 
 
-def numbers(preview: Preview) -> dict:
+def numbers(preview: LiveFlowProcess) -> dict:
     """Return the numbers that the page shows."""
     raw = preview.message()
     return json.loads(raw[4 : 4 + int.from_bytes(raw[:4], "little")])
 
 
-def switched(preview: Preview, stent: Stent) -> tuple[float, float, float]:
+def switched(preview: LiveFlowProcess, stent: Stent) -> tuple[float, float, float]:
     """Return the seconds from the switch to the first number with a band, the number, and its band in points."""
     preview.place((stent,))
     began = perf_counter()
@@ -107,7 +107,7 @@ def switched(preview: Preview, stent: Stent) -> tuple[float, float, float]:
     return float("nan"), float("nan"), float("nan")
 
 
-def prepared(preview: Preview) -> float:
+def prepared(preview: LiveFlowProcess) -> float:
     """Return the seconds until nothing is left to prepare."""
     began = perf_counter()
     while preview.is_preparing:
@@ -122,9 +122,9 @@ def from_switch(name: str, devices: list[str]) -> None:
         stent = vstent.deploy(vstent.find_design(device), anatomy).stent
         found, ready_s = [], []
         with TemporaryDirectory() as folder:
-            shelf = shelf_of(Path(folder), name, settings)
+            store = BareFlowStore.of(Path(folder), name, settings)
             for is_prepared in (False, True, True):
-                preview = Preview(anatomy, settings, shelf if is_prepared else None)
+                preview = LiveFlowProcess(anatomy, settings, store if is_prepared else None)
                 ready_s.append(prepared(preview) if is_prepared else 0.0)
                 found.append(switched(preview, stent))
                 preview.stop()

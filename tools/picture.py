@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from vstent.cli.console import Console
-from vstent.reporting.figures import overview
+from vstent.reporting.figures import Plate, Shot
 from vstent.reporting.scene import scene_of
 from vstent.study import pipeline as study
 from vstent.study.folder import RUN
@@ -21,7 +21,10 @@ def main(case: Path) -> None:
     """Go on with the demo in a case folder, and draw it."""
     record = read_record(case / RUN)
     result = study.run(record.input, record.folder, record.settings, Console().progress)
-    PICTURE.write_bytes(overview(scene_of(result.anatomy, result.implants, result.fields)))
+    scene = scene_of(result.anatomy, result.implants, result.fields)
+    layers = ("lumen", "continued", "wires", "neck", "streamlines")
+    shots = [Shot(title, scene.pick(layers, pane), scene.view("profile")) for pane, title in scene.panes]
+    PICTURE.write_bytes(Plate("demo", "", "", scene, shots, "speed").drawn().png)
 
 
 if __name__ == "__main__":

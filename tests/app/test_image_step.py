@@ -8,7 +8,7 @@ import pytest
 import report_case
 from browsing import browsing, in_time, needs_browser, playwright, step
 
-from vstent.app.cases import STEPS, Store, dependencies
+from vstent.app.cases import STEPS, Cases, dependencies
 from vstent.geometry.image import Image
 from vstent.io.archive import save_data
 from vstent.study.folder import CACHE
@@ -61,7 +61,7 @@ SIZES = [(1920, 1080), (1366, 768), (1024, 768)]
 
 def ball_case(workspace, name, turn=None):
     """A case of which only the scan is there; its axes may be turned about its middle."""
-    case, image = Store(workspace).create(name), ball_scan()
+    case, image = Cases(workspace).create(name), ball_scan()
     if turn is not None:
         affine = image.affine_mm.copy()
         affine[:3, :3] = turn @ affine[:3, :3]
@@ -79,7 +79,7 @@ def analytic_case(workspace):
     places_mm = image.to_mm(np.moveaxis(np.indices((57, 21, 50)), 0, -1).reshape(-1, 3))
     away_mm = np.abs(report_case.anatomy().vessel.lumen.closest(places_mm)[1])
     image = Image((1000 * np.exp(-away_mm)).astype(np.int16).reshape(57, 21, 50), affine)
-    case = Store(workspace).create("analytic")
+    case = Cases(workspace).create("analytic")
     write_nifti(case.folder / "input" / "scan.nii.gz", image)
     (case.folder / CACHE).mkdir()
     save_data(case.folder / CACHE / "anatomy-known.npz", report_case.anatomy())

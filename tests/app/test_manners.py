@@ -9,7 +9,7 @@ import report_case
 from browsing import BROWSER, FLAGS, browsing, in_time, needs_browser, playwright, step
 from test_image_step import analytic_case
 
-from vstent.app.cases import Store
+from vstent.app.cases import Cases
 from vstent.errors import InputError
 
 pytestmark = needs_browser
@@ -186,9 +186,9 @@ def test_only_a_case_of_the_workspace_is_deleted(client, workspace, tmp_path_fac
     """A folder given at the command line is left alone; the picture of a case is a PNG file."""
     elsewhere = tmp_path_factory.mktemp("elsewhere")
     analytic_case(elsewhere)
-    case = Store(workspace).adopt(elsewhere / "analytic")
+    case = Cases(workspace).adopt(elsewhere / "analytic")
     with pytest.raises(InputError, match="Delete it there"):
-        Store(workspace).remove(case)
+        Cases(workspace).remove(case)
     assert (elsewhere / "analytic").is_dir()
     assert client.get("/api/cases/analytic/picture").status_code == 404
     assert client.put("/api/cases/analytic/picture", content=b"GIF89a").status_code == 422

@@ -84,9 +84,9 @@ def test_a_neck_and_lengths_make_what_depends_on_them_stale_and_reach_the_study(
 
 
 def test_the_neck_is_told_over_http(anatomy, tmp_path, monkeypatch):
-    from vstent.app.live import Live
+    from vstent.app.preview import Preview
 
-    monkeypatch.setattr(Live, "anatomy", anatomy)
+    monkeypatch.setattr(Preview, "anatomy", anatomy)
     curve = necks.curve_of(anatomy)
     with app_case.served(tmp_path) as client:
         case = f"/api/cases/{client.post('/api/cases', json={'name': 'x'}).json()['id']}"

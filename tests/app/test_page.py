@@ -19,9 +19,9 @@ import vstent
 from vstent import phantoms
 from vstent.angiography.history import History
 from vstent.app import cuts, intake, ranking, sheets
-from vstent.app.cases import STEPS, Store, load
-from vstent.app.desk import Desk
+from vstent.app.cases import STEPS, Cases, load
 from vstent.app.finished import kept_flows
+from vstent.app.workspace import Workspace
 from vstent.cli import main
 from vstent.deployment.deploy import deploy, propose_landing
 from vstent.deployment.measure import measure
@@ -426,7 +426,7 @@ def test_flows_of_the_best_sizes_join_a_ranking_that_is_there_before(artery, tmp
         best = replace(best, measures=best.measures | {"neck_inflow_change_fraction": -0.4})
         return replace(found, candidates=(best, *others))
 
-    case = Store(tmp_path).create("ranked")
+    case = Cases(tmp_path).create("ranked")
     folder = case.folder
     shutil.copy(artery, folder / "artery.stl")
     choices = case.state.choices.model_copy(update={"treatments": (with_device("enterprise"),), "ranking_flows": 2})
@@ -580,7 +580,7 @@ def test_a_case_of_another_version_is_refused_in_a_sentence_and_left_as_it_is(tm
     state.write_text('{"name": "old", "choices": {"devices": [{"name": "silk"}]}}')
     before = state.read_bytes()
     with pytest.raises(ReadError, match=r"from another version of vstent: open the scan of the case again\.$"):
-        Desk(Store(tmp_path / "cases")).open(tmp_path / "old")
+        Workspace(Cases(tmp_path / "cases")).open(tmp_path / "old")
     assert state.read_bytes() == before
     assert [path.name for path in state.parent.iterdir()] == ["app.json"]
 
@@ -635,7 +635,7 @@ def test_a_setting_that_the_page_does_not_take_is_named(flown, tmp_path):
     told["settings"]["flow"]["numerics"]["cell_size_mm"] = 0.03
     (folder / "run.json").write_text(json.dumps(told))
     with pytest.raises(ReadError, match=r"grid spacing: 0.03 mm is out of range.*vstent run"):
-        Desk(Store(tmp_path / "cases")).open(folder)
+        Workspace(Cases(tmp_path / "cases")).open(folder)
 
 
 def test_a_folder_whose_study_was_run_again_at_the_shell_shows_no_other_results_as_done(flown, tmp_path):
@@ -782,8 +782,8 @@ import socket, sys, threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 import httpx, uvicorn
-from vstent.app.cases import Store
-from vstent.app.desk import Desk
+from vstent.app.cases import Cases
+from vstent.app.workspace import Workspace
 from vstent.app.server import create
 
 importing = set()
@@ -792,7 +792,7 @@ def heard(event, values):
         importing.add(threading.get_ident())
 listener = socket.create_server(("127.0.0.1", 0))
 host = f"127.0.0.1:{listener.getsockname()[1]}"
-guard = create(Desk(Store(Path(sys.argv[1]))), token="t", hosts=(host,))
+guard = create(Workspace(Cases(Path(sys.argv[1]))), token="t", hosts=(host,))
 server = uvicorn.Server(uvicorn.Config(guard, log_level="error"))
 sys.addaudithook(heard)
 thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})

@@ -13,8 +13,8 @@ from vstent import phantoms
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
-from vstent.app.cases import Store
-from vstent.app.reopening import reopened
+from vstent.app.cases import Cases
+from vstent.app.finished import reopened
 from vstent.cli import main
 from vstent.errors import InputError, VesselError
 from vstent.flow import domain, sampling
@@ -341,7 +341,7 @@ def test_a_study_keeps_its_inlets_from_the_command_line_to_the_numbers_and_back(
 
 
 def test_the_page_keeps_the_inlets_of_a_study_that_it_opens(study: Path, tmp_path: Path) -> None:
-    case = reopened(Store(tmp_path), study)
+    case = reopened(Cases(tmp_path), study)
     told = json.loads((study / "run.json").read_text())["settings"]["anatomy"]["inlet_mm"]
     assert case.state.choices.model_dump(mode="json")["inlet_mm"] == told
     assert np.array(case.state.settings().anatomy.inlet_mm).tolist() == told == at_ends(RIGHT, LEFT).tolist()

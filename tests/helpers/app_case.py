@@ -12,9 +12,9 @@ import numpy as np
 import uvicorn
 
 from vstent import phantoms
-from vstent.app.cases import Store
-from vstent.app.desk import Desk
+from vstent.app.cases import Cases
 from vstent.app.server import create
+from vstent.app.workspace import Workspace
 
 TOKEN = "the-token-of-the-tests"
 
@@ -24,10 +24,10 @@ def served(workspace, path=None):
     """A client that is let in; the server ends with the block."""
     listener = socket.create_server(("127.0.0.1", 0))
     host = f"127.0.0.1:{listener.getsockname()[1]}"
-    desk = Desk(Store(workspace))
+    work = Workspace(Cases(workspace))
     if path is not None:
-        desk.open(path)
-    guard = create(desk, token=TOKEN, hosts=(host,))
+        work.open(path)
+    guard = create(work, token=TOKEN, hosts=(host,))
     server = uvicorn.Server(uvicorn.Config(guard, log_level="error", timeout_graceful_shutdown=1))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()

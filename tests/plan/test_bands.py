@@ -18,7 +18,7 @@ from vstent.errors import VstentError
 from vstent.plan.bands import BANDED, INTERVAL, SAMPLES, bands, interval, length_band
 from vstent.plan.rank import rank
 from vstent.plan.shares import centered_points
-from vstent.reporting.bands import ends, how_sure, number_name, rows
+from vstent.reporting.uncertainty import band_rows, ends, how_sure, number_name
 
 SILK = find_design("silk")
 SIZE = find_size(SILK, diameter_mm=4, length_mm=15)
@@ -130,7 +130,7 @@ def test_a_device_whose_numbers_are_exact_has_no_bands():
     assert length_band(straight(), bare, measures) is None
     told = {"deployment": measures, "bands": {"results": {}, "device": "Numbers of X: 3 cited."}}
     assert how_sure(told) == "Numbers of X: 3 cited."
-    assert rows(told) == []
+    assert band_rows(told) == []
     assert how_sure({"deployment": measures}) == ""  # metrics of a version without bands
 
 
@@ -138,7 +138,7 @@ def test_bands_are_told_in_words_with_their_largest_cause():
     deployment, measures = lying()
     found = bands(straight(), deployment, measures, is_proposed=True)
     told = {"deployment": measures, "bands": json.loads(json.dumps(found.metrics())) | {"device": "Numbers."}}
-    (length,) = (row for row in rows(told) if row.name == "Deployed length")
+    (length,) = (row for row in band_rows(told) if row.name == "Deployed length")
     band = found.results["deployed_length_mm"]
     assert (length.low, length.high) == (f"{band.low:.1f}\u202fmm", f"{band.high:.1f}\u202fmm")
     assert ends(told, "deployed_length_mm") == f"({band.low:.1f} to {band.high:.1f}\u202fmm)"

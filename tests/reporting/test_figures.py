@@ -100,7 +100,7 @@ def scene_with(*layers, view):
 
 
 def mesh(surface, colour, opacity=1.0, name="thing"):
-    return MeshLayer(id=name, pane="", colour=colour, scale="", values=np.zeros(0), surface=surface, opacity=opacity)
+    return MeshLayer(id=name, pane="", colour=colour, surface=surface, opacity=opacity)
 
 
 def test_sphere_shows_as_a_disc_of_its_radius_in_its_place():
@@ -118,7 +118,7 @@ def test_sphere_shows_as_a_disc_of_its_radius_in_its_place():
 def test_glass_shows_what_it_holds_and_hides_nothing():
     view = View("front", np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.zeros(3), 3.0)
     glass = mesh(report_case.sphere(np.zeros(3), 2.0), (0.5, 0.5, 0.5), 0.2)
-    line = {"id": "axis", "pane": "", "colour": (1.0, 0.0, 0.0), "scale": "", "values": np.zeros(0)}
+    line = {"id": "axis", "pane": "", "colour": (1.0, 0.0, 0.0)}
     points, starts = np.array([[-1.0, 0, 0], [1, 0, 0]]), np.array([0, 2], np.int32)
     wire = LineLayer(points_mm=points, starts=starts, radius_mm=np.array([0.2]), **line)
     scene = scene_with(glass, wire, view=view)
@@ -134,7 +134,7 @@ def test_far_wires_are_paler_than_near_ones():
     shades = []
     for y in (-1.0, 1.0):  # the eye is at negative y
         points, starts = np.array([[-1.0, y, 0], [1, y, 0]]), np.array([0, 2], np.int32)
-        wire = LineLayer("wires", "", (0.1, 0.1, 0.1), "", np.zeros(0), points, starts, np.array([0.3]))
+        wire = LineLayer("wires", "", (0.1, 0.1, 0.1), points, starts, np.array([0.3]))
         shades.append(figures.draw((wire,), scene_with(wire, view=view), view, (100, 100))[50, 50, 0])
     assert shades[0] < 0.2 < 0.5 < shades[1]
 
@@ -188,7 +188,7 @@ def test_a_contour_is_looked_at_from_the_side_of_its_gap(toward):
     ring = np.stack([2 * np.cos(angle), 2 * np.sin(angle), height_mm], axis=2).reshape(-1, 3)
     gap_mm = np.maximum(ring @ np.array(toward) - 1.2, 0.0)
     tube = Surface(ring, tube_faces(41, 48))
-    contour = MeshLayer("contour", "silk", (0.3, 0.3, 0.3), "wall_gap", gap_mm, tube)
+    contour = MeshLayer("contour", "silk", (0.3, 0.3, 0.3), tube, scale="wall_gap", values=gap_mm)
     view = figures.gap_view(contour, scene_of_view((1.0, 0.0, 0.0)))
     np.testing.assert_allclose(view.axes[2], toward, atol=1e-9)
     np.testing.assert_allclose(view.axes @ view.axes.T, np.eye(3), atol=1e-12)

@@ -9,8 +9,8 @@ import report_case
 from vstent.devices.catalogue import find_design
 from vstent.devices.formulas import free_diameters_mm
 from vstent.reporting import node_rule
-from vstent.reporting.freestanding import free_device, wire_layer
-from vstent.reporting.method import _is_trimmed, mesh_layers
+from vstent.reporting.method import free_device, mesh_layers, method_plates, wire_layer
+from vstent.reporting.scene import scene_of
 
 
 def test_a_device_outside_an_artery_has_its_free_diameter_and_the_wires_of_the_catalogue():
@@ -48,7 +48,11 @@ def test_a_node_is_put_inside_the_wall_at_the_distance_of_the_rule(distance):
 
 def test_a_vessel_that_was_not_trimmed_has_no_picture_of_it():
     anatomy = report_case.anatomy()
-    vessel = anatomy.vessel
-    assert not _is_trimmed(vessel, anatomy)
+    vessel, scene = anatomy.vessel, scene_of(anatomy, {}, {})
+
+    def ids(whole):
+        return [plate.id for plate in method_plates(anatomy, {}, scene, whole)]
+
+    assert ids(vessel) == ids(None) == ["restoration", "spheres"]
     larger = replace(vessel, lumen=report_case.joined(vessel.lumen, report_case.sphere(np.array([30.0, 0, 0]), 3.0)))
-    assert _is_trimmed(larger, anatomy)
+    assert ids(larger) == ["untrimmed", "restoration", "spheres"]

@@ -9,7 +9,8 @@ import pytest
 import report_case
 
 from vstent.reporting.definitions import OF_PULSE
-from vstent.reporting.method import _bead_layer, _expansion, _unit_sphere
+from vstent.reporting.figures import Plate
+from vstent.reporting.method import SPHERE_NODES, method_plates
 from vstent.reporting.paper import LEFT, PAGE_IN, RIGHT, Paper, wrapped
 from vstent.reporting.pdf import as_pdf
 from vstent.reporting.scene import scene_of
@@ -100,8 +101,9 @@ def test_pictures_tell_the_way_from_the_artery_to_the_flow(told):
 
 def test_spheres_on_the_axis_are_as_wide_as_the_artery_and_follow_it_from_end_to_end():
     anatomy = report_case.anatomy()
-    n = len(_unit_sphere()[0])
-    beads = _bead_layer(anatomy).surface.vertices_mm.reshape(-1, n, 3)
+    (plate,) = (one for one in method_plates(anatomy, {}, scene_of(anatomy, {}, {})) if one.id == "spheres")
+    (layer,) = (layer for layer in plate.shots[0].layers if layer.id == "spheres")
+    beads = layer.surface.vertices_mm.reshape(-1, SPHERE_NODES[0] * SPHERE_NODES[1], 3)
     centers = beads.mean(axis=1)
     assert np.linalg.norm(beads - centers[:, None], axis=2) == pytest.approx(report_case.RADIUS_MM, rel=1e-3)
     along = anatomy.parent.axis.nearest_abscissa_mm(centers)
@@ -127,4 +129,6 @@ def test_a_contour_that_lies_on_the_wall_from_the_first_is_shown_too():
     energy, gap = deployment.energy_mm2[:3], np.zeros_like(deployment.wall_gap_mm)
     still = replace(deployment, history_mm=still, energy_mm2=energy, wall_gap_mm=gap)
     scene = scene_of(case.anatomy, {"silk": {"silk": still}}, case.fields)
-    assert _expansion("silk", 0, {"silk": still}, case.anatomy, scene).drawn().image.std() > 1
+    plates = method_plates(case.anatomy, {"silk": {"silk": still}}, scene)
+    (plate,) = (one for one in plates if isinstance(one, Plate) and one.id == "expansion-silk")
+    assert plate.drawn().image.std() > 1

@@ -12,6 +12,9 @@ function text(x, y, words, attributes = {}) {
   return svg("text", { x, y, ...attributes }, [words]);
 }
 
+/** A line across a chart at a height, with its number on the left. */
+const level = (y, left, right, words, kind = "grid") => [svg("line", { x1: left, x2: right, y1: y, y2: y, class: kind }), text(left - 6, y + 4, words, { class: "tick end" })];
+
 /** Lines at round values and their numbers on an axis. */
 function ticks(low, high, count) {
   const raw = (high - low) / count;
@@ -55,17 +58,11 @@ export class AlongChart {
     x.back = (px) => Math.min(Math.max(((px - left) / (width - left - right)) * length, 0), length);
     this.x = x;
     const y = (mm) => height - bottom - ((height - top - bottom) * mm) / most;
-    const parts = [];
-    for (const v of ticks(0, most, 3)) {
-      parts.push(svg("line", { x1: left, x2: width - right, y1: y(v), y2: y(v), class: "grid" }));
-      parts.push(text(left - 6, y(v) + 4, String(v), { class: "tick end" }));
-    }
+    const parts = ticks(0, most, 3).flatMap((v) => level(y(v), left, width - right, String(v)));
     for (const v of ticks(0, length, Math.max(4, width / 110))) parts.push(text(x(v), height - 9, String(v), { class: "tick middle" }));
     parts.push(text(4, 13, "Diameter, mm", { class: "axis-title" }));
     parts.push(text(width - right, 13, width > 480 ? "along the parent artery, mm from the inlet" : "at mm from the inlet", { class: "axis-title end" }));
-    if (neck?.length) {
-      parts.push(svg("rect", { x: x(neck[0]), width: x(neck[1]) - x(neck[0]), y: top, height: height - top - bottom, class: "neck-zone" }));
-    }
+    if (neck?.length) parts.push(svg("rect", { x: x(neck[0]), width: x(neck[1]) - x(neck[0]), y: top, height: height - top - bottom, class: "neck-zone" }));
     parts.push(svg("path", { d: path(axis.abscissa.map((s, i) => [x(s), y(axis.diameter[i])])), class: "line artery" }));
     if (device) parts.push(...this.device(device, x, y, height - bottom));
     if (cursor !== undefined) parts.push(svg("line", { x1: x(cursor), x2: x(cursor), y1: top, y2: height - bottom, class: "cursor" }));
@@ -103,10 +100,7 @@ export class SectionChart {
       for (let i = 0; i < flat.length; i += 4) d += `M${flat[i]} ${-flat[i + 1]}L${flat[i + 2]} ${-flat[i + 3]}`;
       return d;
     };
-    const parts = [
-      svg("path", { d: pieces(section.lumen), class: "cut lumen" }),
-      svg("path", { d: pieces(section.landing), class: "cut landing" }),
-    ];
+    const parts = ["lumen", "landing"].map((name) => svg("path", { d: pieces(section[name]), class: `cut ${name}` }));
     for (const ring of section.rings || []) {
       const points = [];
       for (let i = 0; i < ring.length; i += 2) points.push(`${ring[i]} ${-ring[i + 1]}`);
@@ -140,10 +134,7 @@ export function residualChart(points, tolerance = 0.01) {
   const x = (f) => left + (width - left - 8) * f;
   const low = Math.log10(0.004);
   const y = (v) => top + ((height - top - bottom) * (0 - Math.log10(Math.min(Math.max(v, 0.004), 1)))) / (0 - low);
-  const parts = [1, 0.1, 0.01].flatMap((v) => [
-    svg("line", { x1: left, x2: width - 8, y1: y(v), y2: y(v), class: v === tolerance ? "goal" : "grid" }),
-    text(left - 6, y(v) + 4, `${100 * v} %`, { class: "tick end" }),
-  ]);
+  const parts = [1, 0.1, 0.01].flatMap((v) => level(y(v), left, width - 8, `${100 * v} %`, v === tolerance ? "goal" : "grid"));
   parts.push(text(4, 13, "Convergence error", { class: "axis-title" }), text(width - 8, 13, "goal 1 %", { class: "axis-title end" }));
   parts.push(text(x(0), height - 6, "start", { class: "tick" }), text(x(1), height - 6, "done", { class: "tick end" }));
   if (points.length) {
@@ -160,10 +151,7 @@ export function pulseChart({ time_s, factor }, isPulsatile, times, moment, chose
   const high = 1.1 * Math.max(...factor);
   const x = (t) => left + ((width - left - 8) * t) / time_s.at(-1);
   const y = (f) => height - bottom - ((height - top - bottom) * f) / high;
-  const parts = [0, 1].flatMap((v) => [
-    svg("line", { x1: left, x2: width - 8, y1: y(v), y2: y(v), class: v ? "goal" : "grid" }),
-    text(left - 6, y(v) + 4, String(v), { class: "tick end" }),
-  ]);
+  const parts = [0, 1].flatMap((v) => level(y(v), left, width - 8, String(v), v ? "goal" : "grid"));
   const shown = moment !== undefined && times.length ? `shown: ${times[moment].toFixed(2)} s` : times.length ? "shown: the cycle's mean" : isPulsatile ? "pulsatile" : "steady, at the mean";
   parts.push(text(0, 12, "Inflow / mean", { class: "axis-title" }), text(width - 34, 13, shown, { class: "axis-title end" }));
   for (const t of ticks(0, time_s.at(-1), 4)) parts.push(text(x(t), height - 8, `${t} s`, { class: "tick middle" }));
@@ -193,10 +181,7 @@ export function curvesChart(curves, now, [width, height], title, chosen) {
   const most = 1.08 * Math.max(1e-9, ...curves.flatMap(({ values }) => values));
   const x = (t) => left + ((width - left - right) * t) / last;
   const y = (v) => height - bottom - ((height - top - bottom) * v) / most;
-  const parts = ticks(0, most, 3).flatMap((v) => [
-    svg("line", { x1: left, x2: width - right, y1: y(v), y2: y(v), class: "grid" }),
-    text(left - 6, y(v) + 4, String(v), { class: "tick end" }),
-  ]);
+  const parts = ticks(0, most, 3).flatMap((v) => level(y(v), left, width - right, String(v)));
   for (const t of ticks(0, last, Math.max(4, width / 110))) parts.push(text(x(t), height - 7, `${t} s`, { class: "tick middle" }));
   parts.push(text(4, 13, curves[0].unit, { class: "axis-title" }));
   let place = width - right;

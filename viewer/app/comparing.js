@@ -13,14 +13,12 @@ export class Comparing {
     this.rows = [];
     this.isOn = false;
     this.shown = [];
-    this.asked = new Newest(
-      (answer) => this.take(answer),
-      (problem) => {
-        this.isOn = false;
-        page.complain(problem);
-        page.render();
-      },
-    );
+    const fail = (problem) => {
+      this.isOn = false;
+      page.complain(problem);
+      page.render();
+    };
+    this.asked = new Newest((answer) => this.take(answer), fail);
   }
 
   keyOf({ device, label_diameter_mm, label_length_mm, shift_mm }) {
@@ -30,14 +28,13 @@ export class Comparing {
   tick(row, words) {
     const key = this.keyOf(row);
     const isTicked = this.rows.some((one) => this.keyOf(one) === key);
-    const box = make("input", { type: "checkbox", checked: isTicked, disabled: !isTicked && this.rows.length >= MOST, ariaLabel: `Compare ${words}` });
-    box.dataset.key = `compare ${key}`;
-    box.addEventListener("change", () => {
+    const onChange = () => {
       this.rows = box.checked ? [...this.rows, row] : this.rows.filter((one) => this.keyOf(one) !== key);
       if (this.isOn && this.rows.length) this.ask();
       else if (this.isOn) this.turn(false);
       this.changed();
-    });
+    };
+    const box = make("input", { type: "checkbox", checked: isTicked, disabled: !isTicked && this.rows.length >= MOST, ariaLabel: `Compare ${words}`, data: { key: `compare ${key}` }, onChange });
     return box;
   }
 

@@ -34,11 +34,8 @@ export function chartButton(name, element, lay) {
 /** Ask for size and format; the promise holds whether to save. */
 async function choose() {
   const field = (label, input) => make("label", {}, [make("span", {}, [label]), input]);
-  const select = (key, values, words) => {
-    const box = make("select", {}, values.map((value) => make("option", { value, selected: value === chosen[key] }, [words(value)])));
-    box.dataset.key = key;
-    return box;
-  };
+  const select = (key, values, words) =>
+    make("select", { data: { key } }, values.map((value) => make("option", { value, selected: value === chosen[key] }, [words(value)])));
   const width = make("input", { type: "number", min: 20, max: 400, step: "any", required: true, value: chosen.width });
   width.setAttribute("list", "save-widths");
   const widths = make("datalist", { id: "save-widths" }, WIDTHS.map((mm) => make("option", { value: mm })));

@@ -1,6 +1,6 @@
 // Films of the contrast agent before and after, in step: a slider, curves, and a C-arm that is turned by hand.
 import { integers } from "../src/decode.js";
-import { make } from "../src/dom.js";
+import { button, make } from "../src/dom.js";
 import { inWords, REACH } from "./carm.js";
 import { curvesChart } from "./charts.js";
 import { chartButton, copied, saveButton } from "./exporting.js";
@@ -26,8 +26,7 @@ export class Films {
     this.direction = "";
     this.panes = make("div", { className: "film-panes" });
     this.element = make("div", { className: "films", hidden: true, tabIndex: 0, role: "application", ariaLabel: "Films. Drag to turn the C-arm, arrow keys turn it by 5 degrees." }, [this.panes]);
-    this.slider = make("input", { type: "range", min: 0, max: 0, step: 1, value: 0, ariaLabel: "Time of the film" });
-    this.slider.addEventListener("input", () => this.look(Number(this.slider.value)));
+    this.slider = make("input", { type: "range", min: 0, max: 0, step: 1, value: 0, ariaLabel: "Time of the film", onInput: () => this.look(Number(this.slider.value)) });
     this.play = make("button", { type: "button", onClick: () => this.turn(!this.playing) }, ["▶ Play"]);
     this.clock = make("b", { className: "film-clock" });
     this.chart = make("div", { className: "chart-box" });
@@ -86,11 +85,8 @@ export class Films {
       this.names = names;
       this.canvases = this.frames.map(() => make("canvas", { className: "film-canvas" }));
       this.labels = this.frames.map(() => make("span"));
-      this.panes.replaceChildren(
-        ...this.frames.map(([id], k) =>
-          make("figure", { className: "film-pane" }, [make("figcaption", {}, [make("strong", {}, [this.host.title(id)]), this.labels[k]]), this.canvases[k]]),
-        ),
-      );
+      const figure = ([id], k) => make("figure", { className: "film-pane" }, [make("figcaption", {}, [make("strong", {}, [this.host.title(id)]), this.labels[k]]), this.canvases[k]]);
+      this.panes.replaceChildren(...this.frames.map(figure));
     }
     for (const canvas of this.canvases) [canvas.width, canvas.height] = [width, height];
   }
@@ -177,16 +173,14 @@ export class Films {
 
   /** What is chosen on the left side: the direction in words or by name, and the wires. */
   controls() {
-    const field = make("input", { type: "text", value: this.hasFilm ? inWords(this.angles) : this.direction, placeholder: "LAO 30 CRA 10", id: "field-carm" });
-    field.dataset.key = "carm";
-    field.addEventListener("change", () => this.ask(field.value));
-    const named = NAMED.map(([view, words]) => make("button", { type: "button", onClick: () => this.ask(view) }, [words]));
-    const wires = make("input", { type: "checkbox", checked: this.hasWires });
-    wires.dataset.key = "film-wires";
-    wires.addEventListener("change", () => {
+    const now = this.hasFilm ? inWords(this.angles) : this.direction;
+    const field = make("input", { type: "text", value: now, placeholder: "LAO 30 CRA 10", id: "field-carm", data: { key: "carm" }, onChange: () => this.ask(field.value) });
+    const named = NAMED.map(([view, words]) => button(words, () => this.ask(view)));
+    const onChange = () => {
       this.hasWires = wires.checked;
       this.ask(this.hasFilm ? inWords(this.angles) : this.direction);
-    });
+    };
+    const wires = make("input", { type: "checkbox", checked: this.hasWires, data: { key: "film-wires" }, onChange });
     return [
       make("label", { className: "field", htmlFor: "field-carm" }, [make("span", {}, ["C-arm"]), field, make("small", {}, ["°"])]),
       make("div", { className: "tabs", role: "group", ariaLabel: "Direction" }, named),

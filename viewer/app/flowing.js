@@ -12,8 +12,7 @@ export class Flowing {
     this.host = host;
     this.isOn = false;
     this.drawn = 0; // number of the streamlines that are in the picture
-    this.box = make("input", { type: "checkbox", id: "live-flow" });
-    this.box.addEventListener("change", () => this.turn(this.box.checked));
+    this.box = make("input", { type: "checkbox", id: "live-flow", onChange: () => this.turn(this.box.checked) });
     this.state = make("p", { className: "hint", role: "status" });
     this.cards = make("div", { className: "live-cards" });
     this.chart = svg("svg", { class: "live-chart", viewBox: "0 0 240 64", role: "img", "aria-label": "Change of the neck inflow over the last minute" });
@@ -123,11 +122,7 @@ export class Flowing {
     const low = Math.min(-10, ...history);
     const [x, y] = [(i) => 30 + (206 * i) / Math.max(history.length - 1, 1), (v) => 6 + (52 * v) / low];
     const line = history.map((v, i) => `${i ? "L" : "M"}${x(i).toFixed(1)} ${y(Math.min(v, 0)).toFixed(1)}`).join("");
-    const word = (v) => {
-      const text = svg("text", { x: 26, y: y(v) + 4, class: "tick end" });
-      text.textContent = `${v.toFixed(0).replace("-", "−")} %`;
-      return text;
-    };
+    const word = (v) => svg("text", { x: 26, y: y(v) + 4, class: "tick end" }, [`${v.toFixed(0).replace("-", "−")} %`]);
     const parts = [0, low].map((v) => svg("line", { x1: 30, x2: 236, y1: y(v), y2: y(v), class: "grid" }));
     this.chart.replaceChildren(...parts, word(0), word(low), svg("path", { d: line, class: "line device" }));
   }

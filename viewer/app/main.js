@@ -1,5 +1,5 @@
 // The page: seven steps from a scan to a report, the scene in the middle, the numbers beside it.
-import { make } from "../src/dom.js";
+import { button, make } from "../src/dom.js";
 import { drop, get, getBinary, Newest, post, put } from "./api.js";
 import { Axis } from "./axis.js";
 import { inWords } from "./carm.js";
@@ -45,7 +45,6 @@ class Page {
     this.changes = Promise.resolve();
     this.isFollowing = false; // along the steps of the job that runs
     this.isWhole = false;
-    this.measures = {};
     addEventListener("keydown", (event) => this.key(event));
     addEventListener("hashchange", () => this.route());
     this.begin();
@@ -53,6 +52,8 @@ class Page {
 
   async begin() {
     this.catalogue = await get("/api/catalogue").catch((problem) => this.complain(problem)) || [];
+    this.fields = {};
+    get("/api/openapi.json").then(({ components }) => this.show({ fields: components.schemas.FlowChoice.properties })).catch(() => {}); // without limits the server still checks
     this.names = new Names(this.catalogue, () => this.view?.choices.treatments || []);
     if (!location.hash) {
       const { opened } = await get("/api/cases").catch(() => ({})); // the list of cases asks again
@@ -81,7 +82,7 @@ class Page {
   }
 
   brand() {
-    return make("button", { type: "button", className: "brand", title: "All cases", onClick: () => (location.hash = "") }, ["vstent"]);
+    return button("vstent", () => (location.hash = ""), { className: "brand", title: "All cases" });
   }
 
   badge() {
@@ -171,13 +172,10 @@ class Page {
     this.trimming = new Trimming({ chosen: (changes) => this.choose(changes), told: () => this.picture.stage?.redraw() });
     this.along.chosen = (mm) => this.deploying.look(mm);
     this.imaging = new Imaging(this);
-    this.moments = new Newest(
-      () => {},
-      (problem) => this.complain(problem),
-    );
+    this.moments = new Newest(() => {}, (problem) => this.complain(problem));
     this.stepper = make("nav", { className: "stepper", ariaLabel: "Steps" });
-    this.undoButton = make("button", { type: "button", className: "icon", title: "Undo (Ctrl+Z)", ariaLabel: "Undo", onClick: () => this.stepBack("undo") }, ["↶"]);
-    this.redoButton = make("button", { type: "button", className: "icon", title: "Redo (Ctrl+Shift+Z)", ariaLabel: "Redo", onClick: () => this.stepBack("redo") }, ["↷"]);
+    this.undoButton = button("↶", () => this.stepBack("undo"), { className: "icon", title: "Undo (Ctrl+Z)", ariaLabel: "Undo" });
+    this.redoButton = button("↷", () => this.stepBack("redo"), { className: "icon", title: "Redo (Ctrl+Shift+Z)", ariaLabel: "Redo" });
     this.caseName = make("h1", { className: "case-name" });
     this.panel = make("section", { className: "panel", ariaLabel: "Step" });
     this.work = make("section", { className: "work", ariaLabel: "At work" });
@@ -249,7 +247,10 @@ class Page {
   load() {
     const { view } = this;
     const grid = JSON.stringify([view.id, view.choices.shape, view.choices.spacing_mm]);
-    if (view.is_scan && !view.wants_grid && this.step === "image" && this.scanKey !== grid) this.loadScan(grid);
+    if (view.is_scan && !view.wants_grid && this.step === "image" && this.scanKey !== grid) {
+      this.scanKey = grid;
+      this.imaging.load(grid).catch((problem) => this.complain(problem));
+    }
     if (view.has_anatomy && this.anatomyKey !== view.anatomy) this.loadAnatomy();
     const read = JSON.stringify([view.choices.units, view.choices.frame]);
     if (view.has_input && !view.is_scan && !view.has_anatomy && this.inputKey !== read) this.loadInput(read);
@@ -274,19 +275,10 @@ class Page {
     }
   }
 
-  async loadScan(grid) {
-    this.scanKey = grid;
-    await this.imaging.load(grid).catch((problem) => this.complain(problem));
-  }
-
   /** Turn the slices to the middle of the neck, once one is known. */
   lookAtNeck() {
     const neck = this.anatomy?.neck;
     if (neck?.length) this.imaging.slices?.look(this.axis.at((neck[0] + neck[1]) / 2));
-  }
-
-  showThreshold(threshold) {
-    this.imaging.showThreshold(threshold);
   }
 
   async loadAnatomy() {
@@ -334,13 +326,9 @@ class Page {
       this.stepper,
       ...STEPS.map(([name, title], i) => {
         const status = this.view.steps[name];
-        const button = make(
-          "button",
-          { type: "button", className: `step ${status}`, title: `${title}: ${WORDS[status]}`, ariaCurrent: name === this.step ? "step" : "false", onClick: () => this.go(name) },
-          [make("span", { className: "sign" }, [SIGNS[status] || (status === "running" ? "" : String(i + 1))]), make("span", {}, [title])],
-        );
-        button.dataset.key = name;
-        return button;
+        const words = [make("span", { className: "sign" }, [SIGNS[status] || (status === "running" ? "" : String(i + 1))]), make("span", {}, [title])];
+        const properties = { className: `step ${status}`, title: `${title}: ${WORDS[status]}`, ariaCurrent: name === this.step ? "step" : "false", data: { key: name } };
+        return make("button", { type: "button", ...properties, onClick: () => this.go(name) }, words);
       }),
     );
   }
@@ -356,6 +344,12 @@ class Page {
     this.shape = null;
     this.renderSteps();
     this.load();
+    this.render();
+  }
+
+  /** Change what is seen, and not what is chosen. */
+  show(changes) {
+    Object.assign(this, changes);
     this.render();
   }
 
@@ -448,25 +442,22 @@ class Page {
   openingMarks(chosen = ({ role, center_mm }) => role !== "inlet" && this.choose({ inlet_mm: placeOf({ center_mm }) }), hint = "Click to let blood enter here", className = "opening") {
     return this.anatomy.openings.map((opening) => {
       const { role, center_mm, area_mm2, diameter_mm, colour } = opening;
-      const dot = make("i");
-      dot.style.background = `rgb(${colour})`;
-      const element = make("button", { type: "button", className, title: role.startsWith("inlet") ? "Blood enters here" : hint }, [
-        dot,
+      const element = make("button", { type: "button", className, title: role.startsWith("inlet") ? "Blood enters here" : hint, onClick: () => chosen(opening) }, [
+        make("i", { style: { background: `rgb(${colour})` } }),
         make("b", {}, [spokenRole(role)]),
         make("span", {}, [`${area_mm2.toFixed(1)} mm² · ⌀ ${diameter_mm.toFixed(1)} mm`]),
       ]);
-      element.addEventListener("click", () => chosen(opening));
       return { element, isLabel: true, point: () => center_mm };
     });
   }
 
-  neckPlace() {
+  get neckPlace() {
     return this.neckDrawn ? neckWords(this.neckDrawn, this.anatomy.drawn) : [];
   }
 
   toldNeck(neck) {
     this.neckDrawn = neck;
-    this.panel.querySelector(".place")?.replaceChildren(...this.neckPlace());
+    this.panel.querySelector(".place")?.replaceChildren(...this.neckPlace);
   }
 
   renderDeploy() {
@@ -516,21 +507,17 @@ class Page {
     const { job } = this.view;
     this.work.hidden = !job;
     if (!job) return this.work.replaceChildren();
-    const bar = make("i");
-    bar.style.width = `${Math.max(2, 100 * job.fraction)}%`;
+    const bar = make("i", { style: { width: `${Math.max(2, 100 * job.fraction)}%` } });
     const words = make("div", { className: "work-words" }, [make("b", {}, [job.stage ? this.spoken(job.stage) : "Starting"]), make("span", {}, [progressWords(job) || "…"])]);
-    const stop = make("button", { type: "button", onClick: () => drop(`${this.path}/jobs`).catch((problem) => this.complain(problem)) }, ["Cancel"]);
+    const stop = button("Cancel", () => drop(`${this.path}/jobs`).catch((problem) => this.complain(problem)));
     const done = job.finished.map(({ stage }) => this.spoken(stage));
     const said = make("p", { className: "hint" }, [done.length ? `Done: ${done.join(", ")}.` : "The work continues when this tab is closed."]);
     redraw(this.work, words, make("div", { className: "bar", role: "progressbar", ariaValueNow: String(Math.round(100 * job.fraction)) }, [bar]), stop, said);
   }
 
   renderNumbers() {
-    const head = (title) => {
-      const more = make("button", { type: "button", className: "link", onClick: () => ((this.isWhole = !this.isWhole), this.renderNumbers()) }, [this.isWhole ? "Fewer" : "All"]);
-      more.dataset.key = `whole ${title}`;
-      return make("div", { className: "numbers-head" }, [make("h2", {}, [title]), more]);
-    };
+    const turn = () => ((this.isWhole = !this.isWhole), this.renderNumbers());
+    const head = (title) => make("div", { className: "numbers-head" }, [make("h2", {}, [title]), button(this.isWhole ? "Fewer" : "All", turn, { className: "link", data: { key: `whole ${title}` } })]);
     const parts = [];
     const flow = this.sheets?.flow?.[0];
     if (["flow", "report"].includes(this.step) && flow) {
@@ -560,8 +547,7 @@ class Page {
       if (this.deploying.cursor === undefined && this.anatomy.neck.length) this.deploying.look((this.anatomy.neck[0] + this.anatomy.neck[1]) / 2);
       else this.deploying.look(this.deploying.cursor);
     }
-    const place = this.panel.querySelector(".place");
-    if (place) place.replaceChildren(...placeWords(manifest));
+    this.panel.querySelector(".place")?.replaceChildren(...placeWords(manifest));
   }
 
   /** The bands of the device that lies still; null while it is dragged. */

@@ -1,5 +1,5 @@
 // The left side: what each step is, what can be chosen in it, and its one main button.
-import { make } from "../src/dom.js";
+import { button, make } from "../src/dom.js";
 import { bandWords, placeWords } from "./numbers.js";
 import { isOfDevice, withDevice } from "./treatments.js";
 
@@ -11,21 +11,27 @@ export const spokenRole = (role) => role[0].toUpperCase() + role.slice(1).replac
 
 const title = (words, text) => [make("h2", {}, [words]), make("p", { className: "lead" }, [text])];
 
-function failure(page) {
-  const why = page.view.failed[page.step];
-  return why ? [make("p", { className: "note failed", role: "alert" }, [why])] : [];
-}
+/** A button that stands in a sentence. */
+const link = (words, act) => button(words, act, { className: "link" });
 
-function staleness(page) {
+/** What keeps a step from being done: its failure, a change since it was done; and the button that finds the vessel. */
+function state(page) {
+  const { failed, steps, job, has_anatomy, wants_grid } = page.view;
   const words = page.step === "image" ? "You have changed a setting since this vessel was found." : "You have changed an earlier step. What you see was computed before the change.";
-  return page.view.steps[page.step] === "stale" ? [make("p", { className: "note stale" }, [words])] : [];
+  const isCurrent = ["image", "vessel", "sac"].every((step) => steps[step] === "done");
+  const isFound = ["image", "vessel", "sac"].includes(page.step) && !job && !isCurrent && !wants_grid;
+  return [
+    ...(failed[page.step] ? [make("p", { className: "note failed", role: "alert" }, [failed[page.step]])] : []),
+    ...(steps[page.step] === "stale" && !["device", "deploy"].includes(page.step) ? [make("p", { className: "note stale" }, [words])] : []),
+    ...(isFound ? [main(has_anatomy ? "Find the vessel again" : "Find the vessel", () => page.start("anatomy"))] : []),
+  ];
 }
 
 /** A word where the vessel itself is out of date. */
 function earlier(page) {
   const stale = ["image", "vessel", "sac"].find((step) => page.view.steps[step] === "stale");
   if (!stale || page.view.job) return [];
-  return [make("p", { className: "note stale" }, ["The vessel shown is of an earlier choice. ", make("button", { type: "button", className: "link", onClick: () => page.start("anatomy") }, ["Find it again"])])];
+  return [make("p", { className: "note stale" }, ["The vessel shown is of an earlier choice. ", link("Find it again", () => page.start("anatomy"))])];
 }
 
 /** Further settings of the study that the case was opened from. */
@@ -34,46 +40,47 @@ function unseen(page) {
   return unseen.length ? [make("p", { className: "note" }, [`As in the study that this case was opened from: ${unseen.join(", ")}.`])] : [];
 }
 
-function main(page, words, act, isOff = false) {
-  return make("button", { type: "button", className: "primary wide", disabled: isOff, onClick: act }, [words]);
-}
+const main = (words, act, disabled = false) => button(words, act, { className: "primary wide", disabled });
 
-function next(page, step, words) {
-  return make("button", { type: "button", className: "wide next", onClick: () => page.go(step) }, [words]);
-}
+const next = (page, step, words) => button(words, () => page.go(step), { className: "wide next" });
 
-function number(page, key, label, unit, value, changed, { placeholder = "", step = "any", min } = {}) {
-  const input = make("input", { type: "number", value: value ?? "", placeholder, step, id: `field-${key}` });
-  if (min !== undefined) input.min = min;
+/** An input or a list with its label and unit; `key` finds it again when it is drawn anew. */
+function field(key, label, unit, input, className = "field") {
+  input.id = `field-${key}`;
   input.dataset.key = key;
-  input.addEventListener("change", () => changed(input.value === "" ? null : Number(input.value)));
+  return make("label", { className, htmlFor: input.id }, [make("span", {}, label), input, make("small", {}, [unit])]);
+}
+
+function number(key, label, unit, value, changed, { placeholder = "", step = "any", min = "" } = {}) {
+  const input = make("input", { type: "number", value: value ?? "", placeholder, step, min, onChange: () => changed(input.value === "" ? null : Number(input.value)) });
   const mark = value === null || value === undefined ? [make("em", { className: "proposed" }, ["proposed"])] : [];
-  return make("label", { className: "field", htmlFor: `field-${key}` }, [make("span", {}, [label, ...mark]), input, make("small", {}, [unit])]);
+  return field(key, [label, ...mark], unit, input);
 }
 
 /** A proposed value, to be seen where none is chosen. */
 const proposal = (value, digits) => value?.toFixed(digits) ?? "";
 
 function words(key, label, unit, values, placeholder, changed) {
-  const input = make("input", { type: "text", value: values?.join(" ") ?? "", placeholder, id: `field-${key}` });
-  input.dataset.key = key;
-  input.addEventListener("change", () => changed(input.value));
-  return make("label", { className: "field three", htmlFor: `field-${key}` }, [make("span", {}, [label]), input, make("small", {}, [unit])]);
+  const input = make("input", { type: "text", value: values?.join(" ") ?? "", placeholder, onChange: () => changed(input.value) });
+  return field(key, [label], unit, input, "field three");
 }
 
 function select(key, label, value, options, changed) {
-  const box = make("select", { id: `field-${key}` }, options.map(([id, words]) => make("option", { value: id, selected: String(id) === String(value) }, [words])));
-  box.dataset.key = key;
-  box.addEventListener("change", () => changed(box.value));
-  return make("label", { className: "field", htmlFor: `field-${key}` }, [make("span", {}, [label]), box, make("small")]);
+  const items = options.map(([id, words]) => make("option", { value: id, selected: String(id) === String(value) }, [words]));
+  const box = make("select", { onChange: () => changed(box.value) }, items);
+  return field(key, [label], "", box);
 }
 
-function notes(page, count) {
+/** Buttons of which one is pressed: [id, words] each. */
+function tabs(label, shown, options, show, className = "tabs") {
+  return make("div", { className, role: "group", ariaLabel: label }, options.map(([id, words]) => button(words, () => show(id), { ariaPressed: String(id === shown) })));
+}
+
+/** Notes on the vessel, folded. */
+function notes(page) {
   const all = page.anatomy?.notes || [];
-  if (!all.length) return [];
-  const list = (some) => make("ul", { className: "notes" }, some.map((note) => make("li", {}, [note])));
-  const details = make("details", {}, [make("summary", {}, ["Notes: found, assumed or repaired"]), list(all)]);
-  return [count ? list(all.slice(0, count)) : details];
+  const list = make("ul", { className: "notes" }, all.map((note) => make("li", {}, [note])));
+  return all.length ? [make("details", {}, [make("summary", {}, ["Notes: found, assumed or repaired"]), list])] : [];
 }
 
 /** The points that are given under a key: none, one, or several. */
@@ -82,24 +89,21 @@ function points(page, key) {
   return typeof given[0] === "number" ? [given] : given;
 }
 
-function point(page, key, label) {
-  const places = points(page, key).map((place) => place.map((x) => x.toFixed(1)).join(", "));
-  if (!places.length) return [];
-  return [
-    make("div", { className: "given" }, [
-      make("span", {}, [`${label}: ${places.join("; ")} mm`]),
-      make("button", { type: "button", className: "link", onClick: () => page.choose({ [key]: null }) }, ["Propose again"]),
-    ]),
-  ];
+/** What was given by hand, with a button that leaves it to be proposed. */
+function given(page, key, words) {
+  return make("div", { className: "given" }, [make("span", {}, [words]), link("Propose again", () => page.choose({ [key]: null }))]);
 }
 
-function again(page) {
-  const { steps, job, has_anatomy } = page.view;
-  const isCurrent = ["image", "vessel", "sac"].every((step) => steps[step] === "done");
-  if (job) return [];
-  if (isCurrent || page.view.wants_grid) return [];
-  return [main(page, has_anatomy ? "Find the vessel again" : "Find the vessel", () => page.start("anatomy"))];
+function point(page, key, label) {
+  const places = points(page, key).map((place) => place.map((x) => x.toFixed(1)).join(", "));
+  return places.length ? [given(page, key, `${label}: ${places.join("; ")} mm`)] : [];
 }
+
+/** The least value of a setting of the flow, as the server states it. */
+const leastOf = ({ fields }, key) => fields[key]?.minimum ?? fields[key]?.exclusiveMinimum;
+
+/** How an outlet condition is called where its name in the settings does not say it. */
+const OUTLETS = { murray: "split by r³ (Murray)" };
 
 export const panels = {
   image(page) {
@@ -110,7 +114,7 @@ export const panels = {
       parts.push(select("units", "Length unit", page.view.choices.units ?? "", [["", "derived from the size"], ["mm", "mm"], ["cm", "cm"], ["m", "m"]], (unit) => page.choose({ units: unit || null })));
       parts.push(select("frame", "Frame of the file", page.view.choices.frame ?? "", [["", "as stated, else LPS"], ["lps", "LPS (DICOM)"], ["ras", "RAS (3D Slicer)"]], (frame) => page.choose({ frame: frame || null })));
     }
-    parts.push(...point(page, "at_mm", "Seed"), ...failure(page), ...staleness(page), ...again(page), ...notes(page));
+    parts.push(...point(page, "at_mm", "Seed"), ...state(page), ...notes(page));
     if (page.view.steps.image === "done") parts.push(next(page, "vessel", "Vessel →"));
     return parts;
   },
@@ -119,16 +123,16 @@ export const panels = {
     const parts = [...title("Vessel", "Blood enters through the inlet: click another opening to change it, tick those that bring blood as well. Drag the handles on the artery to keep less of it.")];
     if (page.anatomy) parts.push(openings(page));
     if (page.anatomy?.neck.length) parts.push(...kept(page));
-    parts.push(...point(page, "inlet_mm", "Inlet near"), ...failure(page), ...staleness(page), ...again(page), ...notes(page));
+    parts.push(...point(page, "inlet_mm", "Inlet near"), ...state(page), ...notes(page));
     if (page.view.steps.vessel === "done") parts.push(next(page, "sac", "Sac and parent →"));
     return parts;
   },
 
   sac(page) {
     const parts = [...title("Sac and parent", "The sac (red) is taken off along its neck; the artery beneath it (sand) is what a device opens against. Drag the points on the neck to draw it anew; click a sac to choose it.")];
-    if (page.anatomy) parts.push(select("outlet", "Parent leads to", near(page), [["", proposedOutlet(page)], ...outlets(page)], (role) => page.choose({ outlet_mm: center(page, role) })));
-    if (page.anatomy?.drawn.curve_mm.length) parts.push(make("div", { className: "place" }, page.neckPlace()), ...drawn(page));
-    parts.push(...point(page, "at_mm", "Seed"), ...failure(page), ...staleness(page), ...again(page), ...notes(page));
+    if (page.anatomy) parts.push(parentOutlet(page));
+    if (page.anatomy?.drawn.curve_mm.length) parts.push(make("div", { className: "place" }, page.neckPlace), ...(page.view.choices.neck_mm ? [given(page, "neck_mm", "The neck was drawn by hand.")] : []));
+    parts.push(...point(page, "at_mm", "Seed"), ...state(page), ...notes(page));
     if (page.view.steps.sac === "done") parts.push(next(page, "device", "Device →"));
     return parts;
   },
@@ -139,8 +143,8 @@ export const panels = {
     const parts = [...title("Device", "Choose up to three devices to compare. Every size of each is deployed in this artery and ranked."), ...earlier(page)];
     const others = chosen.filter((treatment) => !isOfDevice(treatment));
     parts.push(make("div", { className: "devices" }, [...others.map((treatment) => treatmentBox(page, treatment)), ...page.catalogue.map((design) => deviceBox(page, design))]));
-    parts.push(...failure(page), ...flowsOfRanking(page));
-    if (!job) parts.push(main(page, has_ranking ? "Rank all sizes again" : "Rank all sizes", () => page.start("rank"), !page.view.has_anatomy || !chosen.length));
+    parts.push(...state(page), ...flowsOfRanking(page));
+    if (!job) parts.push(main(has_ranking ? "Rank all sizes again" : "Rank all sizes", () => page.start("rank"), !page.view.has_anatomy || !chosen.length));
     parts.push(next(page, "deploy", "Deploy →"));
     return parts;
   },
@@ -150,14 +154,17 @@ export const panels = {
     const parts = [...title("Deploy", "Drag either end along the artery. The deployed length follows, because the wires cannot stretch."), ...earlier(page)];
     if (!treatment) return [...parts, make("p", { className: "note" }, ["Choose a device first."]), next(page, "device", "← Device")];
     const isHere = (told) => told?.treatment === treatment.name && told.implant === implant.id;
-    parts.push(...tabs(page), ...sizes(page));
-    const place = make("div", { className: "place" });
-    if (isHere(page.place)) place.append(...placeWords(page.place));
-    const bands = make("div", { className: "bands" });
-    if (isHere(page.bands)) bands.append(...bandWords(page.bands));
-    parts.push(place, bands, ...colours(page), expansion(page));
+    parts.push(...shownTabs(page), ...sizes(page));
+    const colour = "Colour of the wires";
+    parts.push(
+      make("div", { className: "place" }, isHere(page.place) ? placeWords(page.place) : []),
+      make("div", { className: "bands" }, isHere(page.bands) ? bandWords(page.bands) : []),
+      make("div", { className: "label" }, [colour]),
+      tabs(colour, page.colour, [["wall_gap", "Wall gap"], ["coverage", "Coverage"], ["diameter", "Diameter"]], (id) => page.show({ colour: id })),
+      button("▶ Play the expansion", () => page.playExpansion()),
+    );
     if (page.anatomy?.neck?.length) parts.push(page.flowing.element);
-    parts.push(make("p", { className: "advice" }, [page.advice && isHere(page.place) ? page.advice : ""]), ...failure(page));
+    parts.push(make("p", { className: "advice" }, [page.advice && isHere(page.place) ? page.advice : ""]), ...state(page));
     parts.push(make("a", { className: "button wide", href: `${page.path}/plan.pdf`, target: "_blank", rel: "noopener" }, ["One-page plan (PDF)"]));
     parts.push(next(page, "flow", "Flow →"));
     return parts;
@@ -168,13 +175,13 @@ export const panels = {
     const { flow } = choices;
     const parts = [...title("Blood flow", "The flow without a device, then with each. All pictures share one camera and one scale.")];
     parts.push(
-      number(page, "inflow", "Mean inflow", "mL/s", flow.inflow_mL_s, (value) => page.chooseFlow({ inflow_mL_s: value }), { min: 0, placeholder: proposal(page.proposed?.inflow_mL_s, 2) }),
-      number(page, "cell", "Grid spacing", "mm", flow.cell_size_mm, (value) => page.chooseFlow({ cell_size_mm: value }), { min: 0.04, step: 0.01, placeholder: proposal(page.proposed?.cell_size_mm, 3) }),
+      number("inflow", "Mean inflow", "mL/s", flow.inflow_mL_s, (value) => page.chooseFlow({ inflow_mL_s: value }), { min: leastOf(page, "inflow_mL_s"), placeholder: proposal(page.proposed?.inflow_mL_s, 2) }),
+      number("cell", "Grid spacing", "mm", flow.cell_size_mm, (value) => page.chooseFlow({ cell_size_mm: value }), { min: leastOf(page, "cell_size_mm"), step: 0.01, placeholder: proposal(page.proposed?.cell_size_mm, 3) }),
       select("pulse", "Inlet", flow.is_pulsatile ? "1" : "", [["", "steady, at the mean"], ["1", "pulse of the carotid"]], (value) => page.chooseFlow({ is_pulsatile: Boolean(value) })),
-      select("outlets", "Outlets", flow.outlets, [["zero_pressure", "zero pressure"], ["murray", "split by r³ (Murray)"]], (value) => page.chooseFlow({ outlets: value })),
+      select("outlets", "Outlets", flow.outlets, (page.fields.outlets?.enum ?? [flow.outlets]).map((word) => [word, OUTLETS[word] ?? word.replaceAll("_", " ")]), (value) => page.chooseFlow({ outlets: value })),
     );
-    parts.push(page.pulseChart(), ...unseen(page), ...failure(page), ...staleness(page));
-    if (!job) parts.push(main(page, steps.flow === "done" ? "Run again" : "Run the flow", () => page.start("flow"), !page.view.has_anatomy || !page.treatment));
+    parts.push(page.pulseChart(), ...unseen(page), ...state(page));
+    if (!job) parts.push(main(steps.flow === "done" ? "Run again" : "Run the flow", () => page.start("flow"), !page.view.has_anatomy || !page.treatment));
     if (page.flowPanes?.length) parts.push(modes(page), ...films(page));
     if (page.view.has_report && steps.report === "done") parts.push(next(page, "report", "Report →"));
     return parts;
@@ -183,17 +190,17 @@ export const panels = {
   report(page) {
     const parts = [...title("Report", "One file with a 3-D view, pictures, every metric with its definition, and the method. It needs no network.")];
     const { choices, has_flow, has_pdf, has_report, job, steps } = page.view;
-    const link = (file, words, isMain) => make("a", { className: `button wide ${isMain ? "primary" : ""}`, href: `${page.path}/files/${file}`, target: "_blank", rel: "noopener" }, [words]);
-    parts.push(...staleness(page), ...failure(page));
-    if (has_report) parts.push(link("report.html", "Open the report", true));
-    if (has_pdf) parts.push(link("report.pdf", "Report to print (PDF)"));
-    if (has_report) parts.push(link("metrics.json", "Metrics (JSON)"), link("run.json", "Settings and versions (JSON)"));
+    const file = (name, words, isMain) => make("a", { className: `button wide ${isMain ? "primary" : ""}`, href: `${page.path}/files/${name}`, target: "_blank", rel: "noopener" }, [words]);
+    parts.push(...state(page));
+    if (has_report) parts.push(file("report.html", "Open the report", true));
+    if (has_pdf) parts.push(file("report.pdf", "Report to print (PDF)"));
+    if (has_report) parts.push(file("metrics.json", "Metrics (JSON)"), file("run.json", "Settings and versions (JSON)"));
     if (has_flow) {
       const options = [["", "off"], ...[16, 32, 64].map((n) => [String(n), `${n} deployments`])];
       const asked = (count) => page.choose({ uncertainty_samples: count ? Number(count) : null });
       parts.push(select("sure", "Uncertainty", choices.uncertainty_samples ?? "", options, asked));
       parts.push(make("p", { className: "hint" }, ["Deploys every device many times with varied threshold, landing and device diameter. The report then shows a 95 % interval for each result and its main causes."]));
-      if (steps.report !== "done" && steps.flow === "done" && !job) parts.push(main(page, "Write the report again", () => page.start("flow")));
+      if (steps.report !== "done" && steps.flow === "done" && !job) parts.push(main("Write the report again", () => page.start("flow")));
     }
     if (steps.flow !== "done") {
       parts.push(make("p", { className: "note" }, ["The report is written when the flow has been computed."]), next(page, "flow", "← Flow"));
@@ -236,26 +243,25 @@ function threshold(page) {
   const size = `${scan.shape.join(" × ")} voxels of ${scan.spacing_mm.map((x) => x.toFixed(2)).join(" × ")} mm.`;
   const [low, high] = scan.range;
   if (value === undefined) return [make("p", { className: "hint", role: "status" }, ["The threshold is being proposed …"]), make("p", { className: "hint" }, [size])];
-  const slider = make("input", { type: "range", min: low, max: high, step: (high - low) / 500, value, id: "field-threshold" });
-  slider.dataset.key = "threshold";
   const shown = make("b", {}, [value.toFixed(0)]);
-  slider.addEventListener("input", () => {
+  const onInput = () => {
     shown.textContent = Number(slider.value).toFixed(0);
-    page.showThreshold(Number(slider.value));
-  });
+    page.imaging.showThreshold(Number(slider.value));
+  };
   // Keys change it step by step: it is chosen when they rest.
   let timer;
-  slider.addEventListener("change", () => {
+  const onChange = () => {
     clearTimeout(timer);
     timer = setTimeout(() => page.choose({ threshold: Number(slider.value) }), 250);
-  });
+  };
+  const slider = make("input", { type: "range", min: low, max: high, step: (high - low) / 500, value, id: "field-threshold", data: { key: "threshold" }, onInput, onChange });
   const parts = [make("label", { className: "slider", htmlFor: "field-threshold" }, [make("span", {}, ["Threshold ", shown]), slider])];
   if (view.choices.threshold !== null && scan.proposed_threshold !== undefined) {
     const reset = () => {
       page.choose({ threshold: null });
-      page.showThreshold(scan.proposed_threshold);
+      page.imaging.showThreshold(scan.proposed_threshold);
     };
-    parts.push(make("button", { type: "button", className: "link", onClick: reset }, [`Back to the proposed ${scan.proposed_threshold.toFixed(0)}`]));
+    parts.push(link(`Back to the proposed ${scan.proposed_threshold.toFixed(0)}`, reset));
   }
   parts.push(make("p", { className: "hint" }, [size]));
   const keys = [["Wheel", "next slice"], ["Ctrl + wheel", "zoom"], ["Shift + drag", "move the picture"], ["Right button", "window and level"], ["Double click", "one slice alone"]];
@@ -267,18 +273,14 @@ function openings(page) {
   const entered = inlets(page);
   const rows = page.anatomy.openings.flatMap((opening) => {
     const { role, area_mm2, diameter_mm, colour } = opening;
-    const dot = make("i", { className: "dot" });
-    dot.style.background = `rgb(${colour})`;
     const isFirst = opening === entered[0];
-    const box = make("input", { type: "checkbox", checked: entered.includes(opening), title: "Blood enters here", ariaLabel: `${spokenRole(role)}: blood enters here` });
-    box.disabled = isFirst;
-    box.dataset.key = `brings-${role}`;
-    box.addEventListener("change", () => {
+    const onChange = () => {
       const others = entered.filter((one) => one !== opening);
       page.choose({ inlet_mm: (box.checked ? [...others, opening] : others).map(placeOf) });
-    });
+    };
+    const box = make("input", { type: "checkbox", checked: entered.includes(opening), disabled: isFirst, title: "Blood enters here", ariaLabel: `${spokenRole(role)}: blood enters here`, data: { key: `brings-${role}` }, onChange });
     const row = make("button", { type: "button", className: `opening-row ${isFirst ? "inlet" : ""}`, onClick: () => !isFirst && page.choose({ inlet_mm: placeOf(opening) }) }, [
-      dot,
+      make("i", { className: "dot", style: { background: `rgb(${colour})` } }),
       make("span", {}, [spokenRole(role)]),
       make("b", {}, [`${area_mm2.toFixed(1)} mm²`]),
       make("small", {}, [`⌀ ${diameter_mm.toFixed(1)} mm`]),
@@ -301,45 +303,32 @@ const nearest = (openings, point) => openings.map((one) => [Math.hypot(...one.ce
 function kept(page) {
   const { upstream_mm, downstream_mm } = page.view.choices;
   const most = { upstream_mm: 35, downstream_mm: 25 }; // what a study keeps, if the artery is that long
-  const field = (key, words, value) => number(page, key, words, "mm", value, (mm) => page.choose({ [key]: mm }), { min: 1, placeholder: proposal(Math.min(most[key], page.trimming.most(key)), 1) });
-  return [field("upstream_mm", "Before sac", upstream_mm), field("downstream_mm", "Beyond sac", downstream_mm), make("p", { className: "hint" }, ["Lengths of vessel that are kept; every branch is cut as far beyond the sac."])];
+  const length = (key, words, value) => number(key, words, "mm", value, (mm) => page.choose({ [key]: mm }), { min: 1, placeholder: proposal(Math.min(most[key], page.trimming.most(key)), 1) });
+  return [length("upstream_mm", "Before sac", upstream_mm), length("downstream_mm", "Beyond sac", downstream_mm), make("p", { className: "hint" }, ["Lengths of vessel that are kept; every branch is cut as far beyond the sac."])];
 }
 
-/** A word on a neck that was drawn by hand. */
-function drawn(page) {
-  if (!page.view.choices.neck_mm) return [];
-  return [make("div", { className: "given" }, [make("span", {}, ["The neck was drawn by hand."]), make("button", { type: "button", className: "link", onClick: () => page.choose({ neck_mm: null }) }, ["Propose again"])])];
-}
-
-const farEnds = (page) => page.anatomy.openings.filter(({ role }) => role !== "inlet");
-const outlets = (page) => farEnds(page).map(({ role, diameter_mm }) => [role, `${role.replace("_", " ")} (⌀ ${diameter_mm.toFixed(1)} mm)`]);
-
-function center(page, role) {
-  const opening = page.anatomy.openings.find((one) => one.role === role);
-  return opening ? placeOf(opening) : null;
-}
-
-/** The outlet to which the parent artery leads, as it was found. */
-function proposedOutlet(page) {
-  const end = page.anatomy.axis.points.slice(-3);
-  const role = nearest(farEnds(page), end)?.role;
-  return role && !page.view.choices.outlet_mm ? `${role.replace("_", " ")} (proposed)` : "proposed";
-}
-
-function near(page) {
+/** The outlet to which the parent artery leads: as it was given, or found. */
+function parentOutlet(page) {
+  const { openings, axis } = page.anatomy;
   const given = page.view.choices.outlet_mm;
-  return (given && nearest(farEnds(page), given)?.role) || "";
+  const ends = openings.filter(({ role }) => role !== "inlet");
+  const found = nearest(ends, axis.points.slice(-3))?.role;
+  const outlets = ends.map(({ role, diameter_mm }) => [role, `${role.replace("_", " ")} (⌀ ${diameter_mm.toFixed(1)} mm)`]);
+  const chosen = (role) => {
+    const opening = openings.find((one) => one.role === role);
+    page.choose({ outlet_mm: opening ? placeOf(opening) : null });
+  };
+  const proposed = found && !given ? `${found.replace("_", " ")} (proposed)` : "proposed";
+  return select("outlet", "Parent leads to", (given && nearest(ends, given)?.role) || "", [["", proposed], ...outlets], chosen);
 }
 
 /** Tick or untick a treatment. */
 function treatmentTick(page, key, treatment, isChosen) {
-  const box = make("input", { type: "checkbox", checked: isChosen });
-  box.dataset.key = `device-${key}`;
-  box.disabled = !isChosen && page.view.choices.treatments.length >= 3;
-  box.addEventListener("change", () => {
+  const onChange = () => {
     const others = (treatments) => treatments.filter(({ name }) => name !== treatment.name);
     page.choose(({ treatments }) => ({ treatments: box.checked ? [...others(treatments), treatment] : others(treatments) }));
-  });
+  };
+  const box = make("input", { type: "checkbox", checked: isChosen, disabled: !isChosen && page.view.choices.treatments.length >= 3, data: { key: `device-${key}` }, onChange });
   return box;
 }
 
@@ -370,13 +359,14 @@ function deviceBox(page, design) {
 }
 
 /** The treatments, and the implants of the one in view where it has several. */
-function tabs(page) {
+function shownTabs(page) {
   const { treatment, implant } = page;
-  const row = (label, items) => make("div", { className: "tabs", role: "group", ariaLabel: label }, items);
-  const tab = (words, isShown, show) => make("button", { type: "button", ariaPressed: String(isShown), onClick: () => (show(), page.render()) }, [words]);
-  const names = page.view.choices.treatments.map(({ name }) => tab(page.names.treatment(name), name === treatment.name, () => (page.active = name)));
-  const ids = treatment.implants.map(({ id }) => tab(page.names.implant(treatment.name, id), id === implant.id, () => (page.activeImplant = id)));
-  return [row("Treatment", names), ...(ids.length > 1 ? [row("Implant", ids)] : [])];
+  const names = page.view.choices.treatments.map(({ name }) => [name, page.names.treatment(name)]);
+  const ids = treatment.implants.map(({ id }) => [id, page.names.implant(treatment.name, id)]);
+  return [
+    tabs("Treatment", treatment.name, names, (name) => page.show({ active: name })),
+    ...(ids.length > 1 ? [tabs("Implant", implant.id, ids, (id) => page.show({ activeImplant: id }))] : []),
+  ];
 }
 
 function sizes(page) {
@@ -392,29 +382,8 @@ function sizes(page) {
     const [diameter_mm, length_mm] = text ? text.split(",").map(Number) : [null, null];
     page.changeImplant(treatment.name, device.id, { diameter_mm, length_mm });
   };
-  const parts = [select("size", "Size", value, [["", words], ...options], change)];
-  if (device.placing.position_mm !== null) {
-    parts.push(make("button", { type: "button", className: "link", onClick: () => page.choose(page.moved(treatment.name, device.id, null)) }, ["Center it on the neck again"]));
-  }
-  return parts;
-}
-
-function colours(page) {
-  const options = [["wall_gap", "Wall gap"], ["coverage", "Coverage"], ["diameter", "Diameter"]].map(([id, words]) => {
-    const button = make("button", { type: "button", ariaPressed: String(page.colour === id) }, [words]);
-    button.addEventListener("click", () => {
-      page.colour = id;
-      page.render();
-    });
-    return button;
-  });
-  return [make("div", { className: "label" }, ["Colour of the wires"]), make("div", { className: "tabs", role: "group", ariaLabel: "Colour of the wires" }, options)];
-}
-
-function expansion(page) {
-  const play = make("button", { type: "button" }, ["▶ Play the expansion"]);
-  play.addEventListener("click", () => page.playExpansion());
-  return play;
+  const recenter = link("Center it on the neck again", () => page.choose(page.moved(treatment.name, device.id, null)));
+  return [select("size", "Size", value, [["", words], ...options], change), ...(device.placing.position_mm === null ? [] : [recenter])];
 }
 
 /** The angiogram: what is chosen for its films, or the button that computes it. */
@@ -426,19 +395,17 @@ function films(page) {
   const isOff = steps.flow !== "done";
   return [
     make("p", { className: "hint" }, ["Contrast agent is carried through every flow, and filmed as on an angiography unit."]),
-    main(page, "Compute the angiogram", () => page.start("angiogram"), isOff),
+    main("Compute the angiogram", () => page.start("angiogram"), isOff),
   ];
 }
 
+const MODES = [["streamlines", "Streamlines"], ["slice", "Slice"], ["shear", "Wall shear stress"], ["sac_shear", "Shear stress, sac"], ["angiogram", "Angiogram"]];
+
 function modes(page) {
-  const options = [["streamlines", "Streamlines"], ["slice", "Slice"], ["shear", "Wall shear stress"], ["sac_shear", "Shear stress, sac"], ["angiogram", "Angiogram"]].map(([id, words]) => {
-    const button = make("button", { type: "button", ariaPressed: String((page.memory.mode || "streamlines") === id) }, [words]);
-    button.addEventListener("click", () => {
-      page.memory.mode = id;
-      page.memory.flow = {};
-      page.render();
-    });
-    return button;
-  });
-  return make("div", { className: "tabs modes", role: "group", ariaLabel: "Show" }, options);
+  const show = (id) => {
+    page.memory.mode = id;
+    page.memory.flow = {};
+    page.render();
+  };
+  return tabs("Show", page.memory.mode || "streamlines", MODES, show, "tabs modes");
 }

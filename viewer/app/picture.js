@@ -1,7 +1,7 @@
 // The picture: one canvas, panes with a locked camera, buttons for layers and views, marks that lie on the scene.
 import { Raycaster, Vector2, Vector3 } from "three";
-import { make } from "../src/dom.js";
-import { annotate, annotations, colourBar } from "../src/furniture.js";
+import { button, make } from "../src/dom.js";
+import { annotate, colourBar, makePane, sizeOf } from "../src/furniture.js";
 import { Stage } from "../src/stage.js";
 import { anglesOf, axesOf, fromWords, inWords } from "./carm.js";
 import { ask } from "./dialogs.js";
@@ -36,8 +36,7 @@ export class Picture {
       rasters: (scale) => this.photographed(scale),
       words: () => this.written(),
     });
-    this.carm = make("input", { type: "text", className: "chip carm", size: 13, title: "Direction of the view as C-arm angles: type others", ariaLabel: "C-arm angles of the view" });
-    this.carm.addEventListener("change", () => this.turnArm());
+    this.carm = make("input", { type: "text", className: "chip carm", size: 13, title: "Direction of the view as C-arm angles: type others", ariaLabel: "C-arm angles of the view", onChange: () => this.turnArm() });
     this.views = [];
     this.panes = [];
     this.switches = [];
@@ -93,17 +92,12 @@ export class Picture {
 
   setPanes(panes) {
     if (!this.stage || JSON.stringify(panes) === JSON.stringify(this.panes.map(({ id, title, note }) => ({ id, title, note })))) return;
-    this.panes = panes.map(({ id, title, note }) => {
-      const { length, compass } = annotations();
-      const head = make("div", { className: "viewer-title" }, [make("strong", {}, [title || ""]), make("span", {}, [note || ""])]);
-      const button = make("button", { type: "button", className: "viewer-solo", title: "Show this alone, or all again", ariaLabel: `Show ${title || "this"} alone, or all again` }, ["⤢"]);
-      button.addEventListener("click", () => {
-        this.solo = this.solo === id ? null : id;
-        this.layout();
-      });
-      const element = make("div", { className: "viewer-pane" }, [head, length, compass, ...(panes.length > 1 ? [button] : [])]);
-      return { id, title, note, element, length, compass, button };
-    });
+    const solo = (id) => {
+      this.solo = this.solo === id ? null : id;
+      this.layout();
+    };
+    this.panes = panes.map((pane) => makePane(pane, solo));
+    if (panes.length === 1) this.panes[0].button.remove();
     if (!this.panes.some(({ id }) => id === this.solo)) this.solo = null;
     this.grid.replaceChildren(...this.panes.map(({ element }) => element));
     this.layout();
@@ -122,19 +116,17 @@ export class Picture {
     const layers = this.switches
       .filter(({ title }) => title)
       .map(({ id, title, also = [] }) => {
-        const button = make("button", { type: "button", className: "chip", ariaPressed: String(this.shown.has(id)) }, [title]);
-        button.addEventListener("click", () => {
+        const turn = () => {
           const on = !this.shown.has(id);
           this.memory[id] = on;
           for (const one of [id, ...also]) this.shown[on ? "add" : "delete"](one);
-          button.setAttribute("aria-pressed", String(on));
+          chip.setAttribute("aria-pressed", String(on));
           this.apply();
-        });
-        return button;
+        };
+        const chip = button(title, turn, { className: "chip", ariaPressed: String(this.shown.has(id)) });
+        return chip;
       });
-    const views = this.views.map(({ id }, i) =>
-      make("button", { type: "button", className: "chip view", title: `${VIEWS[id][1]} (key ${i + 1})`, onClick: () => this.look(id) }, [VIEWS[id][0]]),
-    );
+    const views = this.views.map(({ id }, i) => button(VIEWS[id][0], () => this.look(id), { className: "chip view", title: `${VIEWS[id][1]} (key ${i + 1})` }));
     const own = this.stage && this.views.length ? [...this.host.kept().map((view) => this.keptChip(view)), this.keepChip(), ...(this.stage.isOriented === false ? [] : [this.carm])] : [];
     const save = this.stage ? [this.save] : [];
     redraw(this.toolbar, make("div", { className: "chips" }, layers), make("div", { className: "chips" }, [...views, ...own, ...save]));
@@ -149,8 +141,8 @@ export class Picture {
     };
     const forget = () => this.host.keep(this.host.kept().filter((view) => view.name !== name));
     return make("span", { className: "kept-view" }, [
-      make("button", { type: "button", className: "chip view", title: "Saved view", onClick: look }, [name]),
-      make("button", { type: "button", className: "chip", title: "Forget this view", ariaLabel: `Forget the view ${name}`, onClick: forget }, ["×"]),
+      button(name, look, { className: "chip view", title: "Saved view" }),
+      button("×", forget, { className: "chip", title: "Forget this view", ariaLabel: `Forget the view ${name}` }),
     ]);
   }
 
@@ -162,7 +154,7 @@ export class Picture {
       const name = await ask({ title: "Save this view", words: ["It is kept with the case, and offered beside the other views."], field: "Name", value: `View ${kept.length + 1}`, button: "Save view" });
       if (name) this.host.keep([...kept.filter((view) => view.name !== name), { name: name.slice(0, 40), axes, center_mm: center, distance_mm: distance }]);
     };
-    return make("button", { type: "button", className: "chip", title: "Save this view under a name", ariaLabel: "Save this view", onClick: keep }, ["+"]);
+    return button("+", keep, { className: "chip", title: "Save this view under a name", ariaLabel: "Save this view" });
   }
 
   /** Turn to the C-arm angles that were typed. */
@@ -212,7 +204,7 @@ export class Picture {
       this.setRanges(range ? [...others, { scale: scale.id, ...range }] : others);
       this.host.keepRanges(this.ranges);
     };
-    return make("button", { type: "button", className: "link range", title: "Change the range of these colours", ariaLabel: `Range of ${scale.title}`, onClick: change }, [stage.ranges[scale.id] ? "range (own)" : "range"]);
+    return button(stage.ranges[scale.id] ? "range (own)" : "range", change, { className: "link range", title: "Change the range of these colours", ariaLabel: `Range of ${scale.title}` });
   }
 
   /** The colour scales of what is seen. */
@@ -259,8 +251,7 @@ export class Picture {
   }
 
   paneSize() {
-    const { element } = this.visiblePanes()[0];
-    return [Math.max(element.clientWidth, 1), Math.max(element.clientHeight, 1)];
+    return sizeOf(this.visiblePanes()[0]);
   }
 
   layout() {

@@ -1,5 +1,5 @@
 // The range of a colour scale: typed, fitted to what is seen, or as computed.
-import { make } from "../src/dom.js";
+import { button, make } from "../src/dom.js";
 import { shown } from "./dialogs.js";
 
 const short = (value) => Number(value.toPrecision(4));
@@ -13,7 +13,6 @@ export async function askRange({ title, unit, low, high, given }, fit) {
   const [least, most] = [number(low), number(high)];
   const fill = (range) => ([least.value, most.value] = [short(range.low), short(range.high)]);
   const check = () => most.setCustomValidity(Number(least.value) < Number(most.value) ? "" : "The highest value must be above the lowest.");
-  const button = (words, act) => make("button", { type: "button", onClick: act }, [words]);
   const form = make("form", { method: "dialog", className: "save-form" }, [
     make("h2", { id: "range-title" }, [title]),
     make("label", {}, [make("span", {}, [`Lowest, ${unit}`]), least]),

@@ -1,5 +1,5 @@
 // The sizing table: all sizes deployed and ranked, with reasons; sorted, filtered and compared; a click chooses one.
-import { make } from "../src/dom.js";
+import { button, make } from "../src/dom.js";
 import { get } from "./api.js";
 import { Comparing } from "./comparing.js";
 import { redraw } from "./redraw.js";
@@ -39,19 +39,19 @@ export class Ranking {
   element() {
     const { view } = this.page;
     const key = JSON.stringify([view.id, view.anatomy, view.has_ranking, view.job?.kind === "rank" ? view.job.finished.length : "", view.steps.device]);
-    if (key === this.key) {
-      this.draw();
-      return this.box;
+    if (key === this.key) this.draw();
+    else {
+      this.key = key;
+      if (!this.found) this.box.replaceChildren(make("p", { className: "hint" }, ["Ranking …"]));
+      get(`${this.page.path}/ranking`).then((found) => this.change({ found })).catch((problem) => this.page.complain(problem));
     }
-    this.key = key;
-    if (!this.found) this.box.replaceChildren(make("p", { className: "hint" }, ["Ranking …"]));
-    get(`${this.page.path}/ranking`)
-      .then((found) => {
-        this.found = found;
-        this.draw();
-      })
-      .catch((problem) => this.page.complain(problem));
     return this.box;
+  }
+
+  /** Draw with another order or other filters. */
+  change(changes) {
+    Object.assign(this, changes);
+    this.draw();
   }
 
   draw() {
@@ -105,35 +105,20 @@ export class Ranking {
 
   filters() {
     const tick = (name, words) => {
-      const box = make("input", { type: "checkbox", checked: this[name] });
-      box.dataset.key = name;
-      box.addEventListener("change", () => {
-        this[name] = box.checked;
-        this.draw();
-      });
+      const box = make("input", { type: "checkbox", checked: this[name], data: { key: name }, onChange: () => this.change({ [name]: box.checked }) });
       return make("label", { className: "ranking-filter" }, [box, words]);
     };
-    const options = [["", "all devices"], ...Object.entries(this.found.names)];
-    const select = make("select", { ariaLabel: "Device" }, options.map(([key, name]) => make("option", { value: key, selected: key === this.device }, [name])));
-    select.dataset.key = "filter";
-    select.addEventListener("change", () => {
-      this.device = select.value;
-      this.draw();
-    });
+    const options = [["", "all devices"], ...Object.entries(this.found.names)].map(([key, name]) => make("option", { value: key, selected: key === this.device }, [name]));
+    const select = make("select", { ariaLabel: "Device", data: { key: "filter" }, onChange: () => this.change({ device: select.value }) }, options);
     return [select, tick("isBest", "best of each device"), tick("isSuitable", "suitable only")];
   }
 
   heading([key, title, meaning]) {
     const [sorted, way] = this.sort;
     const sign = sorted === key ? (way > 0 ? " ↑" : " ↓") : "";
-    const button = make("button", { type: "button", title: `${meaning} Click to sort.`, onClick: () => {
-      this.sort = [key, sorted === key ? -way : key === "score" ? -1 : 1];
-      this.draw();
-    } }, [title + sign]);
-    button.dataset.key = key;
-    const head = make("th", { scope: "col" }, [button]);
-    head.setAttribute("aria-sort", sorted === key ? (way > 0 ? "ascending" : "descending") : "none");
-    return head;
+    const sort = () => this.change({ sort: [key, sorted === key ? -way : key === "score" ? -1 : 1] });
+    const ariaSort = sorted === key ? (way > 0 ? "ascending" : "descending") : "none";
+    return make("th", { scope: "col", ariaSort }, [button(title + sign, sort, { title: `${meaning} Click to sort.`, data: { key } })]);
   }
 
   line(row) {
@@ -141,8 +126,7 @@ export class Ranking {
     const ofDevice = (treatment) => treatment.name === row.device && isOfDevice(treatment);
     const chosen = page.view.choices.treatments.find(ofDevice)?.implants[0];
     const isChosen = chosen && chosen.diameter_mm === row.label_diameter_mm && chosen.length_mm === row.label_length_mm;
-    const score = make("i", { className: "score" });
-    score.style.width = `${48 * row.score}px`;
+    const score = make("i", { className: "score", style: { width: `${48 * row.score}px` } });
     const name = this.found.names[row.device];
     const size = `${row.label_diameter_mm.toFixed(2)} × ${row.label_length_mm}`;
     const cells = [

@@ -1,5 +1,5 @@
 // The bar over the slices: tools, window presets, slab, outlines, and what is under the pointer.
-import { make } from "../src/dom.js";
+import { button, make } from "../src/dom.js";
 import { copied, saveButton } from "./exporting.js";
 import { redraw } from "./redraw.js";
 import { LINES, SEED } from "./sliceview.js";
@@ -23,16 +23,11 @@ export class SliceBar {
     this.slices = slices;
     this.tools = make("div", { className: "tabs slice-tools", role: "group", ariaLabel: "Tool on the slices" });
     this.extra = make("span", { className: "slice-extra" });
-    this.presets = make("select", { ariaLabel: "Window and level" });
-    this.presets.addEventListener("change", () => this.choose(this.presets.value));
-    this.slab = make("select", { ariaLabel: "Slab" }, SLABS.map(([mm, title]) => make("option", { value: mm }, [title])));
-    this.slab.addEventListener("change", () => slices.setSlab(Number(this.slab.value)));
-    this.along = make("select", { ariaLabel: "Direction of the slices" }, [
-      make("option", { value: "patient" }, ["Patient axes"]),
-      make("option", { value: "file" }, ["File axes"]),
-    ]);
-    this.along.title = "This scan is oblique: anatomical planes, interpolated, or the slices of the file";
-    this.along.addEventListener("change", () => slices.stand(this.along.value === "patient"));
+    const select = (ariaLabel, options, onChange, title = "") => make("select", { ariaLabel, title, onChange }, options.map(([value, words]) => make("option", { value }, [words])));
+    this.presets = select("Window and level", [], () => this.choose(this.presets.value));
+    this.slab = select("Slab", SLABS, () => slices.setSlab(Number(this.slab.value)));
+    const hint = "This scan is oblique: anatomical planes, interpolated, or the slices of the file";
+    this.along = select("Direction of the slices", [["patient", "Patient axes"], ["file", "File axes"]], () => slices.stand(this.along.value === "patient"), hint);
     this.words = make("span", { className: "slice-window" });
     this.invert = make("button", { type: "button", title: "Dark vessels on a bright ground", ariaPressed: "false", onClick: () => slices.setWindow({ isInverted: !slices.window.isInverted }) }, ["Invert"]);
     const reset = make("button", { type: "button", title: "Window, zoom and slab as at first", onClick: () => this.reset() }, ["Reset"]);
@@ -108,25 +103,16 @@ export class SliceBar {
 
   renderTools() {
     const { slices } = this;
-    redraw(
-      this.tools,
-      ...TOOLS.map(([id, title, hint]) => {
-        const button = make("button", { type: "button", title: hint, ariaPressed: String(slices.tool === id), onClick: () => slices.setTool(id) }, [title]);
-        if (id === "crop" && slices.isUpright) {
-          button.disabled = true;
-          button.title = "The crop box lies along the axes of the file: choose them for the slices first";
-        }
-        return button;
-      }),
-    );
+    const tool = ([id, title, hint]) => {
+      const isOff = id === "crop" && slices.isUpright;
+      const words = isOff ? "The crop box lies along the axes of the file: choose them for the slices first" : hint;
+      return button(title, () => slices.setTool(id), { title: words, disabled: isOff, ariaPressed: String(slices.tool === id) });
+    };
+    redraw(this.tools, ...TOOLS.map(tool));
     const extra = [];
-    if (slices.rulers.length) extra.push(`${slices.rulers.at(-1).mm.toFixed(1)} mm`, this.small("Remove rulers", () => slices.clearRulers()));
-    if (slices.scan && slices.isCropped) extra.push(this.small("Whole scan", () => (slices.setCrop(null), slices.letCropGo())));
+    if (slices.rulers.length) extra.push(`${slices.rulers.at(-1).mm.toFixed(1)} mm`, button("Remove rulers", () => slices.clearRulers(), { className: "link" }));
+    if (slices.scan && slices.isCropped) extra.push(button("Whole scan", () => (slices.setCrop(null), slices.letCropGo()), { className: "link" }));
     redraw(this.extra, ...extra);
-  }
-
-  small(title, act) {
-    return make("button", { type: "button", className: "link", onClick: act }, [title]);
   }
 
   renderChips() {
@@ -136,13 +122,12 @@ export class SliceBar {
     const chips = Object.entries(LINES)
       .filter(([name]) => has[name])
       .map(([name, { title, colour, dash, width }]) => {
-        const swatch = make("i", { className: name === "wires" ? "swatch wires" : "swatch" });
-        swatch.style.borderTop = `${Math.round(width + 0.6)}px ${dash.length ? (dash[0] > 4 ? "dashed" : "dotted") : "solid"} ${colour}`;
+        const borderTop = `${Math.round(width + 0.6)}px ${dash.length ? (dash[0] > 4 ? "dashed" : "dotted") : "solid"} ${colour}`;
+        const swatch = make("i", { className: name === "wires" ? "swatch wires" : "swatch", style: { borderTop } });
         return make("button", { type: "button", className: "slice-chip", ariaPressed: String(slices.on[name]), onClick: () => slices.toggle(name) }, [swatch, title]);
       });
     if (slices.seed) {
-      const dot = make("i", { className: "swatch seed" });
-      dot.style.borderColor = SEED;
+      const dot = make("i", { className: "swatch seed", style: { borderColor: SEED } });
       chips.push(make("button", { type: "button", className: "slice-chip", title: "Turn the slices to the seed", onClick: () => slices.put(slices.seed) }, [dot, "Seed"]));
     }
     redraw(this.chips, ...chips);

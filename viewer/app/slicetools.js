@@ -115,12 +115,11 @@ export class Handling {
       Home: () => slices.turn(view, 0),
       End: () => slices.turn(view, Infinity),
       "+": () => slices.zoomBy(STEP, view),
-      "=": () => slices.zoomBy(STEP, view),
       "-": () => slices.zoomBy(1 / STEP, view),
       0: () => slices.resetView(),
       Enter: () => slices.plant(view, slices.cross),
       Escape: () => slices.clearRulers(1),
-    }[event.key];
+    }[event.key === "=" ? "+" : event.key];
     if (arrows[event.key]) this.nudge(arrows[event.key], event.shiftKey ? 5 : 1);
     else if (act) act();
     else if (KEYS[event.key] && !(KEYS[event.key] === "crop" && slices.isUpright)) slices.setTool(KEYS[event.key]);

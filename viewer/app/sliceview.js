@@ -23,7 +23,7 @@ export class SliceView {
     this.host = host;
     this.buffer = document.createElement("canvas");
     this.canvas = make("canvas", { className: "slice-canvas" });
-    this.slider = make("input", { type: "range", min: 0, value: 0 });
+    this.slider = make("input", { type: "range", min: 0, value: 0, onInput: () => host.turn(this, Number(this.slider.value)) });
     this.label = make("span", { className: "slice-label" });
     this.letters = SIDES.map((side) => make("span", { className: `slice-side at-${side}` }));
     this.grow = make("button", { type: "button", className: "slice-grow", onClick: () => host.maximise(this) }, [
@@ -32,7 +32,6 @@ export class SliceView {
     this.length = make("span", { className: "slice-length" });
     this.area = make("div", { className: "slice-area", tabIndex: 0, role: "group" }, [this.canvas, ...this.letters, this.length]);
     this.element = make("div", { className: "slice" }, [this.area, this.label, this.grow, this.slider]);
-    this.slider.addEventListener("input", () => host.turn(this, Number(this.slider.value)));
     this.plane = null;
     this.outlines = null;
     new ResizeObserver(() => this.paint()).observe(this.area);

@@ -1,5 +1,5 @@
 // Where a case begins: drop a scan, open a case, or try the demo.
-import { make } from "../src/dom.js";
+import { button, make } from "../src/dom.js";
 import { drop as remove, get, post, put } from "./api.js";
 import { ask } from "./dialogs.js";
 
@@ -21,26 +21,23 @@ export function startPage(open, complain) {
     make("h1", {}, ["Drop a scan or a vessel surface here"]),
     make("p", {}, [KINDS]),
     make("div", { className: "drop-buttons" }, [
-      make("button", { type: "button", className: "primary", onClick: () => file.click() }, ["Choose files"]),
-      make("button", { type: "button", onClick: () => folder.click() }, ["Choose a DICOM folder"]),
-      make("button", { type: "button", onClick: tryDemo }, ["Try the demo"]),
+      button("Choose files", () => file.click(), { className: "primary" }),
+      button("Choose a DICOM folder", () => folder.click()),
+      button("Try the demo", tryDemo),
     ]),
     said,
     file,
     folder,
   ]);
-  zone.addEventListener("dragover", (event) => {
+  const over = (isOver) => (event) => {
     event.preventDefault();
-    zone.classList.add("over");
-  });
-  zone.addEventListener("dragleave", () => zone.classList.remove("over"));
-  zone.addEventListener("drop", async (event) => {
-    event.preventDefault();
-    zone.classList.remove("over");
-    bring(await dropped(event.dataTransfer));
-  });
+    zone.classList.toggle("over", isOver);
+  };
+  zone.addEventListener("dragover", over(true));
+  for (const name of ["dragleave", "drop"]) zone.addEventListener(name, over(false));
+  zone.addEventListener("drop", async ({ dataTransfer }) => bring(await dropped(dataTransfer)));
   const list = make("div", { className: "recent" });
-  const show = ({ cases }) => list.replaceChildren(...recent(cases, { open, show, complain }));
+  const show = ({ cases }) => list.replaceChildren(...(cases.length ? [make("h2", {}, ["Open an earlier case"])] : []), ...cases.map((one) => recentCase(one, { open, show, complain })));
   const load = () =>
     get("/api/cases")
       .then(show)
@@ -51,12 +48,6 @@ export function startPage(open, complain) {
   load();
   const privacy = "Files stay on this machine. Of DICOM files only the image is kept, without name, date and number of the patient.";
   return make("main", { className: "start" }, [zone, make("p", { className: "hint" }, [privacy]), list]);
-}
-
-/** The earlier cases, each with picture, name, progress and date, and what can be done with it. */
-function recent(cases, host) {
-  if (!cases.length) return [];
-  return [make("h2", {}, ["Open an earlier case"]), ...cases.map((one) => recentCase(one, host))];
 }
 
 const DATE = new Intl.DateTimeFormat(undefined, { dateStyle: "medium", timeStyle: "short" });
@@ -83,8 +74,8 @@ function recentCase({ id, name, done, kept, changed_s, has_picture }, { open, sh
   return make("article", { className: "recent-card" }, [
     make("button", { type: "button", className: "recent-case", onClick: () => open(id) }, [picture, make("b", {}, [name]), words]),
     make("div", { className: "recent-tools" }, [
-      make("button", { type: "button", className: "link", ariaLabel: `Rename ${name}`, onClick: rename }, ["Rename"]),
-      make("button", { type: "button", className: "link", ariaLabel: `Delete ${name}`, onClick: discard }, ["Delete"]),
+      button("Rename", rename, { className: "link", ariaLabel: `Rename ${name}` }),
+      button("Delete", discard, { className: "link", ariaLabel: `Delete ${name}` }),
     ]),
   ]);
 }

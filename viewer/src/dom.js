@@ -1,10 +1,12 @@
 // Elements, made with few words.
 
-/** An element with properties (role and aria... become attributes) and children. */
+/** An element with properties (role and aria... become attributes, `style` and `data` are objects) and children. */
 export function make(tag, properties = {}, children = []) {
   const element = document.createElement(tag);
   for (const [name, value] of Object.entries(properties)) {
     if (name === "role") element.setAttribute("role", value);
+    else if (name === "style") Object.assign(element.style, value);
+    else if (name === "data") Object.assign(element.dataset, value);
     else if (name.startsWith("aria")) element.setAttribute(`aria-${name.slice(4).toLowerCase()}`, value);
     else if (name.startsWith("on")) element.addEventListener(name.slice(2).toLowerCase(), value);
     else element[name] = value;
@@ -12,6 +14,9 @@ export function make(tag, properties = {}, children = []) {
   element.append(...children);
   return element;
 }
+
+/** A button with properties; without words it is for others to fill. */
+export const button = (words, onClick, properties = {}) => make("button", { type: "button", onClick, ...properties }, [words]);
 
 /** An SVG element with attributes and children. */
 export function svg(tag, attributes = {}, children = []) {

@@ -1,7 +1,7 @@
 // The viewer: mount(element, manifest, base64) draws a scene with its switches; report.html and the page both call it.
 import { unpack } from "./decode.js";
-import { make } from "./dom.js";
-import { annotate, annotations, colourBar, gradient } from "./furniture.js";
+import { button, make } from "./dom.js";
+import { annotate, colourBar, gradient, makePane, sizeOf } from "./furniture.js";
 import { Stage } from "./stage.js";
 
 // What the page makes use of too: it is loaded beside this bundle, and three.js need not come twice.
@@ -87,7 +87,7 @@ class Viewer {
   }
 
   build() {
-    this.panes = this.manifest.panes.map((pane) => this.pane(pane));
+    this.panes = this.manifest.panes.map((pane) => makePane(pane, (id) => this.turnSolo(id)));
     this.grid = make("div", { className: "viewer-panes" }, this.panes.map((pane) => pane.element));
     const words = `3-D view: ${this.manifest.panes.map((pane) => pane.title).join(", ")}. Arrow keys turn, plus and minus zoom.`;
     this.area = make("div", { className: "viewer-area", tabIndex: 0, role: "application", ariaLabel: words }, [
@@ -104,35 +104,19 @@ class Viewer {
     );
   }
 
-  pane({ id, title, note }) {
-    const button = make("button", { className: "viewer-solo", type: "button", title: "Show this alone, or all again" }, ["⤢"]);
-    button.setAttribute("aria-label", `Show ${title} alone, or all again`);
-    const { length, compass } = annotations();
-    const head = make("div", { className: "viewer-title" }, [make("strong", {}, [title]), make("span", {}, [note || ""])]);
-    const element = make("div", { className: "viewer-pane" }, [head, button, length, compass]);
-    button.addEventListener("click", () => {
-      this.solo = this.solo === id ? null : id;
-      this.layout();
-    });
-    return { id, element, head, length, compass, button };
+  /** Show a pane alone, or all again. */
+  turnSolo(id) {
+    this.solo = this.solo === id ? null : id;
+    this.layout();
   }
 
   modeButtons() {
-    this.modeInputs = this.modes.map((mode) => {
-      const button = make("button", { type: "button" }, [mode.title]);
-      button.addEventListener("click", () => this.setMode(mode));
-      return { mode, button };
-    });
-    return group("Show", this.modeInputs.map(({ button }) => button), "viewer-modes");
+    this.modeInputs = this.modes.map((mode) => ({ mode, button: button(mode.title, () => this.setMode(mode)) }));
+    return group("Show", this.modeInputs.map((input) => input.button), "viewer-modes");
   }
 
   viewButtons() {
-    this.viewInputs = this.manifest.views.map(({ id }, i) => {
-      const button = make("button", { type: "button", title: `Key ${i + 1}` }, [VIEWS[id]]);
-      button.addEventListener("click", () => this.look(id));
-      return button;
-    });
-    return group("Look", this.viewInputs);
+    return group("Look", this.manifest.views.map(({ id }, i) => button(VIEWS[id], () => this.look(id), { title: `Key ${i + 1}` })));
   }
 
   help() {
@@ -143,8 +127,7 @@ class Viewer {
   sidebar() {
     this.boxes = new Map();
     const rows = LAYERS.filter(([id]) => this.present.has(id)).map(([id, title]) => {
-      const box = make("input", { type: "checkbox" });
-      box.addEventListener("change", () => this.toggle(id, box.checked));
+      const box = make("input", { type: "checkbox", onChange: () => this.toggle(id, box.checked) });
       this.boxes.set(id, box);
       return make("label", {}, [box, this.swatch(id), make("span", {}, [title])]);
     });
@@ -153,31 +136,21 @@ class Viewer {
 
   swatch(id) {
     const layer = this.manifest.layers.find((one) => one.id === id);
-    const swatch = make("i", { className: "viewer-swatch" });
     const scale = this.stage.scales[layer.scale];
-    swatch.style.background = scale ? gradient(scale) : `rgb(${layer.colour.map((c) => Math.round(255 * c))})`;
-    return swatch;
+    return make("i", { className: "viewer-swatch", style: { background: scale ? gradient(scale) : `rgb(${layer.colour.map((c) => Math.round(255 * c))})` } });
   }
 
   expansion() {
     if (this.stage.nFrames < 2) return "";
-    this.slider = make("input", { type: "range", min: 0, max: 1, step: 0.005, value: 1, ariaLabel: "Expansion of the device" });
-    const play = make("button", { type: "button", className: "viewer-play" }, ["▶ Expand"]);
-    this.slider.addEventListener("input", () => this.setMoment(Number(this.slider.value)));
-    play.addEventListener("click", () => this.play());
-    this.player = make("div", { className: "viewer-expansion" }, [
-      play,
-      make("span", {}, ["start"]),
-      this.slider,
-      make("span", {}, ["deployed"]),
-    ]);
+    this.slider = make("input", { type: "range", min: 0, max: 1, step: 0.005, value: 1, ariaLabel: "Expansion of the device", onInput: () => this.setMoment(Number(this.slider.value)) });
+    const play = button("▶ Expand", () => this.play(), { className: "viewer-play" });
+    this.player = make("div", { className: "viewer-expansion" }, [play, make("span", {}, ["start"]), this.slider, make("span", {}, ["deployed"])]);
     return this.player;
   }
 
   play() {
     const started = performance.now();
-    const run = Symbol("run");
-    this.run = run;
+    const run = (this.run = Symbol("run"));
     const step = (now) => {
       if (this.run !== run) return;
       const moment = Math.min(1, Math.max(0, now - started) / 2500);
@@ -237,8 +210,7 @@ class Viewer {
   }
 
   paneSize() {
-    const pane = this.panes.find(({ element }) => !element.hidden).element;
-    return [Math.max(pane.clientWidth, 1), Math.max(pane.clientHeight, 1)];
+    return sizeOf(this.panes.find(({ element }) => !element.hidden));
   }
 
   layout() {
@@ -277,6 +249,5 @@ class Viewer {
 const needed = (mode) => ({ device: "contour", wires: "wires", flow: "streamlines", shear: "shear", sac_shear: "sac_shear" })[mode];
 
 function group(label, children, className = "") {
-  const element = make("div", { className: `viewer-group ${className}`, role: "group", ariaLabel: label }, children);
-  return element;
+  return make("div", { className: `viewer-group ${className}`, role: "group", ariaLabel: label }, children);
 }

@@ -235,10 +235,6 @@ class Case:
         self.tell()
         return self._state
 
-    def rename(self, name: str) -> State:
-        """Change the display name; folder and address stay."""
-        return self.update(name=name)
-
     def _check(self, revision: int) -> None:
         """Raise Conflict where the case was changed since a revision."""
         if revision != self._state.revision:
@@ -289,7 +285,7 @@ def identifier(name: str) -> str:
     return plain or "case"
 
 
-class Store:
+class Cases:
     """All cases of a workspace folder, and the case given on the command line."""
 
     def __init__(self, workspace: Path) -> None:

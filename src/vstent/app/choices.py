@@ -1,6 +1,7 @@
 """The user's choices as the page and the REST interface state them, and their conversion to settings of a study."""
 
 from dataclasses import fields, replace
+from math import isfinite
 from typing import Annotated, Any, Final, Self, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model, field_validator, model_validator
@@ -39,7 +40,10 @@ def offered(kind: type, *without: str) -> dict[str, Any]:
     for one in fields(kind):
         if "option" in one.metadata and one.name not in without:
             option: Option = one.metadata["option"]
-            about = Field(description=f"{option.help}; {option.limits}".rstrip("; "))
+            low, above, high = option.limits.low, option.limits.above, option.limits.high
+            ends = {"minimum": low, "exclusiveMinimum": above, "maximum": high}
+            stated: dict[str, Any] = {name: end for name, end in ends.items() if isfinite(end)}
+            about = Field(description=f"{option.help}; {option.limits}".rstrip("; "), json_schema_extra=stated)
             found[one.name] = Annotated[one.type, AfterValidator(option.checked), about], one.default
     return found
 

@@ -34,7 +34,7 @@ def cut(pane: str, field: FlowField, anatomy: Anatomy) -> MeshLayer:
     points_mm = middle + columns[..., None] * right + rows[..., None] * up
     speed = np.linalg.norm(values_at(field, points_mm.reshape(-1, 3))[0], axis=1)
     surface, used = _where_blood_is(points_mm, is_blood(field, points_mm.reshape(-1, 3)))
-    return MeshLayer("slice", pane, (0.5, 0.5, 0.5), "speed", speed[used], surface)
+    return MeshLayer("slice", pane, (0.5, 0.5, 0.5), surface, scale="speed", values=speed[used])
 
 
 def _where_blood_is(points_mm: Floats, is_blood: Bools) -> tuple[Surface, Ints]:

@@ -11,7 +11,7 @@ from collections import deque
 from contextlib import suppress
 from typing import Any, Final
 
-from vstent.app.cases import Case, State, dependencies
+from vstent.app.cases import Case, dependencies
 from vstent.children import environment
 
 KINDS: Final = {
@@ -72,7 +72,7 @@ class Job:
         self._given = case.state
         keys = dependencies(self._given)
         self._has_anatomy = all(self._given.done.get(step) == keys[step] for step in KINDS["anatomy"])
-        self._is_stopped = False
+        self._is_stopped = self._is_abandoned = False
         command = [sys.executable, "-m", "vstent.app.worker", kind, str(case.folder)]
         with (case.folder / LAST_WORDS).open("w", encoding="utf-8") as last_words:
             self._process = subprocess.Popen(
@@ -119,7 +119,7 @@ class Job:
 
     def abandon(self) -> None:
         """Stop because the server ends; the stored state still names the job, so that it is resumed."""
-        self.case = _Deaf(self.case)  # type: ignore[assignment]
+        self._is_abandoned = True
         self._kill()
 
     def _kill(self) -> None:
@@ -139,6 +139,8 @@ class Job:
             self._process.stdin.write(self._given.model_dump_json(exclude={"undo", "redo"}) + "\n")
         for line in self._process.stdout:
             told = json.loads(line)
+            if self._is_abandoned:
+                continue
             if "error" in told:
                 failure = told["error"]
             elif "anatomy" in told:
@@ -149,6 +151,8 @@ class Job:
         with suppress(BrokenPipeError):
             self._process.stdin.close()
         code = self._process.wait()
+        if self._is_abandoned:
+            return
         if self._is_stopped:
             failure = STOPPED
         elif code and not failure:
@@ -197,20 +201,6 @@ class Job:
         self.case.update(done=done, failed=failed, failed_with=failed_with, job="")
 
 
-class _Deaf:
-    """Replaces a case that must not receive further messages."""
-
-    def __init__(self, case: Case) -> None:
-        self.state: State = case.state
-
-    def update(self, **_: Any) -> State:
-        """Do nothing."""
-        return self.state
-
-    def tell(self) -> None:
-        """Do nothing."""
-
-
 class Jobs:
     """The running jobs, at most one per case."""
 
@@ -218,30 +208,31 @@ class Jobs:
         self._jobs: dict[str, Job] = {}
         self._lock = threading.Lock()
 
-    def of(self, case: Case) -> Job | None:
-        """Return the running or last job of a case."""
-        return self._jobs.get(case.id)
+    def has(self, case: Case) -> bool:
+        """Whether a job of a case runs or has run."""
+        return case.id in self._jobs
+
+    def running(self, case: Case) -> Job | None:
+        """Return the running job of a case; None where none runs."""
+        job = self._jobs.get(case.id)
+        return job if job is not None and job.is_alive else None
 
     @property
     def are_running(self) -> bool:
         """Whether a job runs on any case."""
         return any(job.is_alive for job in tuple(self._jobs.values()))
 
-    def start(self, case: Case, kind: str) -> Job:
+    def start(self, case: Case, kind: str) -> None:
         """Start a job; a running one is stopped first."""
         with self._lock:
-            current = self._jobs.get(case.id)
-            if current is not None and current.is_alive:
-                current.stop()
+            self.stop(case)
             failed = {step: why for step, why in case.state.failed.items() if step not in KINDS[kind]}
             case.update(job=kind, failed=failed)
             self._jobs[case.id] = Job(case, kind)
-            return self._jobs[case.id]
 
     def stop(self, case: Case) -> None:
         """Stop the job of a case."""
-        job = self._jobs.get(case.id)
-        if job is not None and job.is_alive:
+        if job := self.running(case):
             job.stop()
 
     def abandon(self) -> None:

@@ -1,614 +1,368 @@
-"""Answer the page immediately, from the results that a case has so far."""
+"""Live flow of a case, in a process of its own that steps while the page watches.
 
-import threading
-from collections.abc import Callable, Hashable, Sequence
+The process first prepares the flow without a device, for a limited time, and stores it in the case folder. After that
+it only steps while somebody asks for its numbers. It leaves the processor to everything else that the page does. It
+ends when the server does, or when nobody has asked for some minutes.
+"""
+
+import os
+import time
+from collections import deque
 from contextlib import suppress
-from dataclasses import replace
-from datetime import date
-from functools import partial
+from dataclasses import dataclass, field, replace
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Final, Literal, TypeVar
+from threading import Condition, Lock, Thread
+from typing import TYPE_CHECKING, Final, Self
 
-import numpy as np
-from scipy.spatial import cKDTree
-
-from vstent.anatomy.morphology import Measures, morphology
-from vstent.angiography.history import History
-from vstent.angiography.view import angles_of
-from vstent.angiography.working_projection import working_projection
-from vstent.app import necks, sheets
-from vstent.app.cases import Case
-from vstent.app.cuts import cut
-from vstent.app.films import films_message, kept_curves
-from vstent.app.finished import kept_flows, kept_histories
-from vstent.deployment.contour import planes
-from vstent.deployment.deploy import propose_landing
-from vstent.deployment.measure import measure
-from vstent.deployment.method import laid_inside
-from vstent.deployment.sketch import Bed, Sketch, bed, sketch
-from vstent.devices.catalogue import find_design
-from vstent.devices.formulas import coverage_fraction, free_diameters_mm
-from vstent.devices.stent import Deployment, Landing, Stent
-from vstent.devices.treatment import BARE, Implant, Treatment
-from vstent.errors import InputError, ReadError, VstentError
-from vstent.flow.case import FlowField
-from vstent.flow.domain import default_cell_size_mm
-from vstent.flow.problem import vessel_case
+from vstent.children import spawning
+from vstent.devices.stent import Stent
+from vstent.errors import InputError, VstentError
+from vstent.flow.case import FlowCase
 from vstent.flow.settings import FlowSettings
-from vstent.geometry.surface import Surface
-from vstent.geometry.vessel import Anatomy, Opening
-from vstent.io.archive import load_data
-from vstent.kernels import clipping
-from vstent.kernels.arrays import Floats
-from vstent.reporting import bands as words
+from vstent.geometry.vessel import Anatomy
+from vstent.io.archive import DAMAGE
 from vstent.reporting.packing import message
-from vstent.reporting.scene import (
-    LineLayer,
-    MeshLayer,
-    View,
-    anatomy_layers,
-    device_layers,
-    flow_layers,
-    implant_titles,
-    node_coverage,
-    scales_of,
-    treatment_title,
-    view_of,
-    views_of,
-)
-from vstent.study.folder import CACHE
-from vstent.study.stages import bands_of, deploy_implant, landing_of, on_path, size_of
+from vstent.reporting.scene import LineLayer, scales_of, stream_layer
+from vstent.study.keys import key_of
+from vstent.study.store import Key, Store
 
-Colour = Literal["wall_gap", "coverage", "diameter"]
-"""Quantity that colors the wires."""
-Anchor = Literal["proximal", "center", "distal"]
-"""Part of a device that a position refers to."""
-Found = TypeVar("Found")
+if TYPE_CHECKING:  # imported by the process, so that the server does not wait for it
+    from vstent.flow.lattice.live import LiveFlow
 
-LOCK: Final = threading.RLock()
-"""Lock for one computation at a time, because parallel compiled loops must not run concurrently."""
-KEPT: Final = 40
-"""Number of results cached per case."""
-SECTION_REACH_MM: Final = 9.0
-"""Distance from the axis within which a section shows surfaces, in mm."""
-BESIDE_MM: Final = 8.0
-"""Length of artery on each side of the neck that the profile view shows, in mm."""
-NEIGHBOURS: Final = 3
-"""Number of consecutive wire points that have the color of one node, the nearest to the first of them."""
-OPENING_COLOURS: Final = (
-    (0.00, 0.45, 0.70),
-    (0.90, 0.62, 0.00),
-    (0.00, 0.62, 0.45),
-    (0.80, 0.47, 0.65),
-    (0.34, 0.71, 0.91),
-)
-"""Okabe and Ito's colors, distinguishable with color vision deficiency; inlets have the first."""
+Stents = tuple[Stent, ...]
+"""Devices of a treatment in the order of their deployment."""
+
+NICE: Final = 10
+"""Priority of the process, below that of the server."""
+SLICE_S: Final = 0.15
+"""Time between two messages of the process, in s."""
+LINES_S: Final = 0.5
+"""Time between two sets of streamlines, in s; three times as long until a number has a band, which comes sooner so."""
+WATCHED_S: Final = 2.0
+"""Time after the last request for which the process goes on stepping, in s."""
+PREPARED_S: Final = 60.0
+"""Longest time for which the flow without a device is computed while nobody watches, in s."""
+IDLE_S: Final = 600.0
+"""Time without a request after which the process ends and frees its memory, in s."""
+FREE_BYTES: Final = 2e9
+"""Free memory below which nothing is computed in advance, in bytes; the process of C0038 takes 0.5 GB."""
+STORED: Final = "live"
+"""Name under which the flow without a device is stored."""
+STALE_S: Final = 1.5
+"""Age of the last message from which it counts as stale, in s."""
+HISTORY: Final = 240
+"""Number of readings that the chart shows."""
+LINES: Final = 70
+"""Number of streamlines through the neck."""
+ERROR_POINTS: Final = 8.0
+"""Largest difference of a reduction from that of a full computation, once it is averaged long enough, in percentage
+points; the largest one measured is 6 (`benchmarks/live.py`)."""
+SHOWN_POINTS: Final = 30.0
+"""Uncertainty of the averages in percentage points above which a reduction is shown without a band."""
+COMPARED: Final = ("neck_inflow_mL_s", "sac_velocity_m_s")
+"""Names of the values that the page compares with the flow without a device."""
 
 
-class Live:
-    """Results of one case, loaded or computed on demand, and cached."""
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """A message of the process."""
 
-    def __init__(self, case: Case) -> None:
-        self.case = case
-        self.shown: tuple[Stent, ...] = ()  # the devices that were drawn last
-        self._follow: Callable[[tuple[Stent, ...]], None] | None = None
-        self._memory: dict[Hashable, Any] = {}
-
-    def remembered(self, key: Hashable, find: Callable[[], Found]) -> Found:
-        """Return the cached result of a key; where there is none, compute and cache it."""
-        with LOCK:
-            if key not in self._memory:
-                found = find()
-                while len(self._memory) >= KEPT:
-                    self._memory.pop(next(iter(self._memory)))
-                self._memory[key] = found
-            found = self._memory[key]
-        return found
+    serial: int = 0
+    """Number of the device that the numbers belong to; 0: the flow without a device."""
+    fraction: float = 0.0
+    """Part of the flow without a device that is computed."""
+    values: dict[str, float] = field(default_factory=dict)
+    """Neck inflow (mL/s) and sac velocity (m/s), without a device and now, and the steps per second; empty as long as
+    they are not known well enough to be shown."""
+    points: dict[str, float] = field(default_factory=dict)
+    """Uncertainty of the averages behind every reduction, in percentage points, where it is known."""
+    is_settled: bool = False
+    """Whether the last readings agree."""
+    is_prepared: bool = False
+    """Whether nothing is left to compute in advance."""
+    error: str = ""
+    """Why it cannot be computed."""
+    lines: LineLayer | None = None
+    """Streamlines through the neck; None: unchanged."""
 
     @property
-    def anatomy(self) -> Anatomy:
-        """Last anatomy found.
+    def reductions(self) -> dict[str, float]:
+        """Change of every value against the flow without a device, in percent; empty without values."""
+        return {
+            key: 100 * (self.values[f"now_{key}"] / max(self.values[f"bare_{key}"], 1e-12) - 1)
+            for key in COMPARED
+            if f"now_{key}" in self.values
+        }
 
-        Raises
-        ------
-        ReadError
-            There is no anatomy yet.
-        """
-        key = self.case.state.anatomy
-        path = self.case.folder / CACHE / f"anatomy-{key}.npz"
-        if not key:
-            raise ReadError("The vessel has not been found yet. Run the first three steps.")
-        return self.remembered(("anatomy", key), lambda: load_data(path, Anatomy))
 
-    def choice(self, name: str) -> Treatment:
-        """Return a chosen treatment by its name.
+class _Sender:
+    """Sends to the process from a thread of its own: the anatomy first, then of what waits only the newest.
 
-        Raises
-        ------
-        ReadError
-            It is not chosen.
-        """
-        for treatment in self.case.state.choices.treatments:
-            if treatment.name == name:
-                return treatment
-        raise ReadError(f"{name} is not among the chosen treatments.")
+    An anatomy or a device is larger than the buffer of a pipe, so sending it takes until the process reads it. Whoever
+    draws the device must not wait for that.
+    """
 
-    def bed(self, implant: Implant) -> Bed:
-        """Return the artery prepared for an implant of the chosen size."""
-        path, asked = implant.placing.path, (implant.device, implant.diameter_mm, implant.length_mm)
+    def __init__(self, pipe: Connection, anatomy: Anatomy) -> None:
+        self._pipe, self._ready, self._anatomy = pipe, Condition(), anatomy
+        self._device: tuple[int, Stents] | None = None
+        self._is_asked = self._is_over = False
+        Thread(target=self._run, daemon=True).start()
 
-        def find() -> Bed:
-            anatomy = on_path(self.anatomy, path)
-            return bed(find_design(implant.device), size_of(implant, anatomy), anatomy)
+    def send(self, device: tuple[int, Stents] | None) -> None:
+        """Send the devices with their number, or None as a request to go on, as soon as the process reads."""
+        with self._ready:
+            self._device, self._is_asked = device or self._device, True
+            self._ready.notify()
 
-        return self.remembered(("bed", self.case.state.anatomy, path, *asked), find)
+    def end(self) -> None:
+        """Close the pipe."""
+        with self._ready:
+            self._is_over = True
+            self._ready.notify()
 
-    def sketch(self, implant: Implant, landing: Landing | None) -> Sketch:
-        """Return the expected position of an implant, as if it opened against the wall of the artery.
+    def _run(self) -> None:
+        """Send until the end, or until the process has ended."""
+        with suppress(OSError):
+            self._pipe.send(self._anatomy)
+            while True:
+                with self._ready:
+                    self._ready.wait_for(lambda: self._is_asked or self._is_over)
+                    if self._is_over:
+                        break
+                    device, self._device, self._is_asked = self._device, None, False
+                self._pipe.send(device)
+        self._pipe.close()
+
+
+@dataclass(frozen=True)
+class BareFlowStore:
+    """Where the flow without a device is stored; a file that cannot be read or written only costs run time."""
+
+    folder: Path
+    """Cache folder of the case."""
+    key: Key
+    """Key of the flow."""
+
+    @classmethod
+    def of(cls, folder: Path, anatomy: str, settings: FlowSettings) -> Self:
+        """Return where it is stored for an anatomy of this key and settings of the flow."""
+        return cls(folder, key_of("vstent.flow.lattice.live", anatomy, settings, without=("vstent.deployment",)))
+
+    def load(self, case: FlowCase) -> "LiveFlow | None":
+        """Return the live flow of a case continued from the stored one; None where there is none."""
+        from vstent.flow.lattice.live import BareFlow, LiveFlow
+
+        stored = Store(self.folder).load(STORED, self.key, BareFlow)
+        if stored is not None:
+            with suppress(*DAMAGE):
+                return LiveFlow(case, stored=stored)
+        return None
+
+    def save(self, live: "LiveFlow") -> None:
+        """Store the flow without a device."""
+        with suppress(OSError):
+            Store(self.folder).save(STORED, self.key, live.stored())
+
+
+class LiveFlowProcess:
+    """Live flow of one anatomy.
+
+    Parameters
+    ----------
+    anatomy : vessel with a sac.
+    settings : settings of the flow, which is steady.
+    store : where the flow without a device is stored; None: nowhere.
+
+    Raises
+    ------
+    InputError
+        The vessel has no sac.
+    """
+
+    def __init__(self, anatomy: Anatomy, settings: FlowSettings, store: BareFlowStore | None = None) -> None:
+        if not anatomy.aneurysms:
+            raise InputError("Live flow needs a sac, and none was found. Choose one in the step Sac and parent.")
+        self.anatomy, self.settings, self.store = anatomy, settings, store
+        self._lock, self._serial = Lock(), 0
+        self._stents: Stents | None = None
+        self._watched_s = -WATCHED_S
+        self._begin()
+
+    def _begin(self) -> None:
+        """Start the process."""
+        self._reading, self._at_s, self._sent = Reading(), time.monotonic(), 0
+        self._lines: LineLayer | None = None
+        self._drawn = 0
+        self._history: deque[float] = deque(maxlen=HISTORY)
+        context = get_context("spawn")
+        pipe, theirs = context.Pipe()
+        self._process = context.Process(target=work, args=(theirs, self.settings, self.store), daemon=True)
+        with spawning():
+            self._process.start()
+        theirs.close()
+        self._sender = _Sender(pipe, self.anatomy)
+        Thread(target=self._follow, args=(pipe,), daemon=True).start()
+
+    def _follow(self, pipe: Connection) -> None:
+        """Note the last message of the process until it ends."""
+        with suppress(EOFError, OSError):
+            while True:
+                reading = pipe.recv()
+                with self._lock:
+                    self._reading, self._at_s = reading, time.monotonic()
+                    if reading.lines is not None:
+                        self._lines, self._drawn = reading.lines, self._drawn + 1
+                    if reading.values:
+                        self._history.append(reading.reductions["neck_inflow_mL_s"])
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether somebody has asked for the numbers a short time ago."""
+        return time.monotonic() - self._watched_s < WATCHED_S
+
+    @property
+    def is_preparing(self) -> bool:
+        """Whether the process computes although nobody watches."""
+        return not self.is_watched and not self._reading.is_prepared and self._process.is_alive()
+
+    def place(self, stents: Stents) -> None:
+        """Put the devices of a treatment into the flow in place of the last ones; unwatched they are only noted."""
+        with self._lock:
+            self._serial += 1
+            self._stents = stents
+        if self.is_watched:
+            self._send()
+
+    def _send(self) -> None:
+        """Send the devices where the process does not have them, else the request to go on."""
+        with self._lock:
+            is_new, self._sent = self._sent != self._serial, self._serial
+            device = (self._serial, self._stents) if is_new and self._stents is not None else None
+        self._sender.send(device)
+
+    def message(self, seen: int = 0) -> bytes:
+        """Return the numbers and new streamlines as a message for the page; the process goes on for a while.
 
         Parameters
         ----------
-        implant : the implant.
-        landing : its position; None: the chosen position, or the proposed one where none is chosen.
+        seen : number of the streamlines that the page has; they are not sent again. 0: none.
         """
-        with LOCK:
-            wall, anatomy = self.bed(implant), on_path(self.anatomy, implant.placing.path)
-            lay = partial(sketch, wall)
-            landing = landing or landing_of(implant, anatomy, wall.size)
-            if landing is None:
-                return laid_inside(lay, propose_landing(wall.design, anatomy, wall.size))
-            return lay(landing)
-
-    def _of_implant(self, what: str, treatment: Treatment, implant: Implant, find: Callable[[], Found]) -> Found:
-        """Return a cached result of a deployed implant; where there is none, compute and cache it."""
-        return self.remembered((what, self.case.state.anatomy, *_before(treatment, implant), implant), find)
-
-    def deployment(self, treatment: Treatment, implant: Implant) -> Deployment:
-        """Return a deployed implant; those that it opens inside are deployed before it."""
-
-        def find() -> Deployment:
-            inside = [self.deployment(treatment, _one(treatment, name)).stent for name in implant.inside]
-            return deploy_implant(implant, self.anatomy, inside)
-
-        return self._of_implant("deployment", treatment, implant, find)
-
-    def deployed(self, treatment: Treatment) -> dict[str, Deployment]:
-        """Return the deployed implants of a treatment by id."""
-        return {implant.id: self.deployment(treatment, implant) for implant in treatment.implants}
-
-    def stents(self, treatment: Treatment) -> tuple[Stent, ...]:
-        """Return the devices of a deployed treatment in their order."""
-        return tuple(one.stent for one in self.deployed(treatment).values())
-
-    def measures(self, treatment: Treatment, implant: Implant) -> Measures:
-        """Return the measures of a deployed implant."""
-        return self._of_implant(
-            "measures", treatment, implant, lambda: measure(self.anatomy, self.deployment(treatment, implant))
-        )
-
-    def metrics(self, treatment: Treatment, implant: Implant) -> dict[str, Any]:
-        """Return the measures of a deployed implant with its bands, as in the metrics of a study."""
-
-        def find() -> dict[str, Any]:
-            measures = self.measures(treatment, implant)
-            return measures | {"bands": bands_of(self.anatomy, self.deployment(treatment, implant), measures, implant)}
-
-        return self._of_implant("metrics", treatment, implant, find)
-
-    def _wires(self, pane: str, treatment: Treatment, colour: Colour, but: str = "") -> list[LineLayer]:
-        """Return the wires of the deployed implants of a treatment, without those of the implant `but`."""
-        layers = []
-        for implant in treatment.implants:
-            if implant.id != but:
-                found = self.deployment(treatment, implant)
-                coverage = partial(
-                    self._of_implant, "coverage", treatment, implant, partial(node_coverage, found.stent)
-                )
-                layers.append(_wires(pane, found.stent, found.wall_gap_mm, colour, coverage))
-        return layers
-
-    def _drawn(self, pane: str, treatment: Treatment, colour: Colour) -> list[MeshLayer | LineLayer]:
-        """Return wires and contours of a deployed treatment in a pane."""
-        contours = [device_layers(pane, one, self.anatomy)[0] for one in self.deployed(treatment).values()]
-        return [*self._wires(pane, treatment, colour), *contours]
-
-    def _sheets(self, treatment: Treatment) -> list[dict[str, Any]]:
-        """Return the tables of the deployed implants of a treatment."""
-        titles = implant_titles(self.deployed(treatment))
-        return [sheets.device(titles[one.id], self.measures(treatment, one)) for one in treatment.implants]
-
-    def bands_sheet(self, treatment: Treatment, implant: str) -> dict[str, Any]:
-        """Return the bands of a deployed implant as the page shows them."""
-        with LOCK:
-            metrics = self.metrics(treatment, _one(treatment, implant))
-        told = {"treatment": treatment.name, "implant": implant}
-        return told | {"sentence": words.how_sure(metrics), "rows": words.rows(metrics)}
-
-    def follow(self, take: Callable[[tuple[Stent, ...]], None] | None) -> None:
-        """Hand the devices that are drawn, and all later ones, to the live flow; None: to nobody."""
-        self._follow = take
-        if take is not None and self.shown:
-            take(self.shown)
-
-    def _show(self, stents: tuple[Stent, ...]) -> None:
-        """Note the devices that are drawn, and tell the live flow."""
-        self.shown = stents
-        if self._follow is not None:
-            self._follow(stents)
-
-    def _field(self, path: Path, moment: int | None) -> FlowField:
-        """Return a flow: its mean, or one moment of its last cycle."""
-        field = self.remembered(("flow", path, path.stat().st_mtime_ns), lambda: load_data(path, FlowField))
-        return field if moment is None or not field.phases else field.at_phase(field.phases[moment % len(field.phases)])
-
-    def _flow_layers(self, name: str, path: Path, moment: int | None) -> list[MeshLayer | LineLayer]:
-        """Return the layers of a flow, with its cut."""
-        key = ("flow layers", path, path.stat().st_mtime_ns, self.case.state.anatomy, moment)
-
-        def find() -> list[MeshLayer | LineLayer]:
-            field = self._field(path, moment)
-            return [*flow_layers(name, field, self.anatomy), cut(name, field, self.anatomy)]
-
-        return self.remembered(key, find)
-
-    def plan(self) -> bytes:
-        """Return the plan of the chosen treatments as PDF, one page per implant.
-
-        Raises
-        ------
-        InputError
-            No device is chosen, or one does not fit.
-        """
-        from vstent.reporting.plan_sheet import Planned, plan_pdf
-
-        state, day = self.case.state, date.today().isoformat()
-        chosen = state.choices.treatments
-        if not chosen:
-            raise InputError("No device is chosen. Choose one in the step Device.")
-        with LOCK:
-            found = {one.name: self.deployed(one) for one in chosen}
-            metrics = {one.name: {part.id: self.metrics(one, part) for part in one.implants} for one in chosen}
-            return plan_pdf(Planned(state.name, self.anatomy, found, metrics, state.source, day))
-
-    # -- messages for the page -----------------------------------------------------------------------------------------
-
-    def anatomy_message(self) -> bytes:
-        """Return vessel, openings, sac, neck, parent artery and axis with their numbers, as a message for the page."""
-        anatomy = self.anatomy
-        openings = anatomy.vessel.openings
-        layers = [*anatomy_layers(anatomy), *(_disc(k, opening) for k, opening in enumerate(openings))]
+        if not self._process.is_alive() and not self._reading.error:
+            if self._reading.fraction >= 1.0:  # it had begun to step
+                self._sender.end()
+                self._begin()
+            else:
+                error = "The live flow ended unexpectedly. Switch it on again, or run the step Flow instead."
+                self._reading = Reading(error=error)
+        self._watched_s = time.monotonic()
+        self._send()
+        with self._lock:
+            reading, age_s, lines, drawn = self._reading, time.monotonic() - self._at_s, self._lines, self._drawn
+            history = list(self._history)
+        layers = [] if lines is None or drawn == seen else [lines]
         return message(
             layers,
-            views=_views(anatomy),
-            fade=1.2 * float(np.median(anatomy.parent.section_radius_mm)),
-            axis=_axis(anatomy),
-            is_oriented=anatomy.vessel.is_oriented,
-            openings=[_said(opening) for opening in openings],
-            notes=[*anatomy.vessel.notes, *anatomy.notes],
-            neck=_neck_span(anatomy),
-            drawn=necks.told(necks.curve_of(anatomy)),
+            scales_of(layers, self.anatomy),
+            drawn=drawn,
+            fraction=reading.fraction,
+            error=reading.error,
+            is_settled=reading.is_settled,
+            is_stale=reading.serial != self._serial or age_s > STALE_S,
+            values=reading.values,
+            reductions=reading.reductions,
+            history=history,
+            error_points={key: ERROR_POINTS + points for key, points in reading.points.items()},
         )
 
-    def neck_message(self, curve_mm: Floats, handle: int | None, to_mm: Floats | None) -> bytes:
-        """Return a neck with its area, optionally with one handle moved to a point of the wall.
-
-        Shapes: `curve_mm` (n, 3), `to_mm` (3,).
-        """
-        with LOCK:
-            if handle is not None and to_mm is not None:
-                curve_mm = necks.pulled(self.anatomy, curve_mm, handle, to_mm)
-            return message([necks.layer_of(curve_mm)], neck=necks.told(curve_mm))
-
-    def anatomy_sheet(self) -> list[dict[str, Any]]:
-        """Return the metrics of the anatomy."""
-        measures = self.remembered(("morphology", self.case.state.anatomy), lambda: morphology(self.anatomy))
-        return sheets.anatomy(measures)
-
-    def proposed(self) -> dict[str, Any]:
-        """Return the values that the study proposes where none is chosen: inflow, grid spacing and device sizes."""
-        devices = dict.fromkeys(key for one in self.case.state.choices.treatments for key in one.devices)
-
-        def find() -> dict[str, Any]:
-            given = self.case.state.former_settings().flow or FlowSettings()
-            case = vessel_case(
-                self.anatomy.vessel,
-                replace(given, inflow_mL_s=None, numerics=replace(given.numerics, cell_size_mm=None)),
-            )
-            sizes = {}
-            for key in devices:
-                with suppress(VstentError):
-                    sizes[key] = size_of(Implant(key, key), self.anatomy).label
-            return {"inflow_mL_s": case.inflow_mL_s, "cell_size_mm": default_cell_size_mm(case), "sizes": sizes}
-
-        return self.remembered(("proposed", self.case.state.anatomy, *devices), find)
-
-    def sketch_message(self, treatment: Treatment, implant: str, landing: Landing | None, colour: Colour) -> bytes:
-        """Return the wires of an implant at its expected position, with the others of its treatment as deployed."""
-        with LOCK:
-            pane, found = treatment.name, self.sketch(_one(treatment, implant), landing)
-            others = {one.id: self.deployment(treatment, one).stent for one in treatment.implants if one.id != implant}
-            self._show(tuple(others.get(one.id, found.stent) for one in treatment.implants))
-            wires = _wires(pane, found.stent, found.gap_mm, colour, lambda: _formula_coverage(found.stent))
-            layers = [wires, *self._wires(pane, treatment, colour, but=implant)]
-            place = _place(found, found.stent)
-            return message(layers, scales_of(layers, self.anatomy), treatment=pane, implant=implant, **place)
-
-    def deployment_message(self, treatment: Treatment, implant: str, colour: Colour) -> bytes:
-        """Return a deployed treatment with its expansion and its metrics, and the place of one of its implants."""
-        with LOCK:
-            one, deployed = _one(treatment, implant), self.deployed(treatment)
-            stent = deployed[implant].stent
-            self._show(self.stents(treatment))
-            layers = self._drawn(treatment.name, treatment, colour)
-            landing = landing_of(one, on_path(self.anatomy, one.placing.path), stent.size)
-            found = laid_inside(partial(sketch, self.bed(one)), landing or Landing(_center_mm(stent)))
-            return message(
-                layers,
-                scales_of(layers, self.anatomy),
-                treatment=treatment.name,
-                implant=implant,
-                **_place(found, stent),
-                title=treatment_title(deployed),
-                advice=deployed[implant].advice,
-                measures=self._sheets(treatment),
-            )
-
-    def comparison_message(self, treatments: Sequence[Treatment], colour: Colour) -> bytes:
-        """Return several deployed treatments, each in a pane of its own, on common color scales."""
-        with LOCK:
-            layers: list[MeshLayer | LineLayer] = []
-            told = []
-            for number, treatment in enumerate(treatments):
-                pane, title = f"compared {number}", treatment_title(self.deployed(treatment))
-                layers += self._drawn(pane, treatment, colour)
-                told.append({"pane": pane, "title": title, "measures": self._sheets(treatment)})
-            return message(layers, scales_of(layers, self.anatomy), compared=told)
-
-    def flow_message(self, moment: int | None) -> bytes:
-        """Return wall shear stress, streamlines and a cut of every flow, on common color scales.
-
-        Raises
-        ------
-        ReadError
-            Flows are missing.
-        """
-        with LOCK:
-            paths = kept_flows(self.case.folder)
-            if not paths:
-                raise ReadError("Some flows of these results are missing. Run the step Flow.")
-            layers = [layer for name, path in paths.items() for layer in self._flow_layers(name, path, moment)]
-            bare = self._field(next(iter(paths.values())), None)
-            most = _peak(bare)
-            of_scales = layers if moment is None or most is None else self._flow_layers(BARE, paths[BARE], most)
-            return message(layers, scales_of(of_scales, self.anatomy), **_moments(bare, moment), panes=list(paths))
-
-    def films_message(self, direction: str, *, has_wires: bool = False, moment: int | None = None) -> bytes:
-        """Return the films of every flow along one direction.
-
-        Raises
-        ------
-        ReadError
-            The angiogram has not been computed.
-        """
-        with LOCK:
-            paths = kept_histories(self.case.folder)
-            if not paths:
-                raise ReadError("The angiogram has not been computed for these flows. Compute it in the step Flow.")
-            histories = {name: self._history(path) for name, path in paths.items()}
-            chosen = {one.name: one for one in self.case.state.choices.treatments if has_wires}
-            stents = {name: self.stents(chosen[name]) for name in histories if name in chosen}
-            angles = angles_of(direction) if direction else self._working_projection()
-            curves = kept_curves(self.case.folder) if moment is None else None
-            return films_message(histories, angles, stents=stents, moment=moment, curves=curves)
-
-    def _history(self, path: Path) -> History:
-        """Return the stored contrast of a flow."""
-        return self.remembered(("contrast", path, path.stat().st_mtime_ns), lambda: load_data(path, History))
-
-    def _working_projection(self) -> tuple[float, float]:
-        """Return the angles of the proposed direction."""
-        return self.remembered(("direction", self.case.state.anatomy), lambda: working_projection(self.anatomy))
-
-    def section(self, name: str | None, implant: str | None, abscissa_mm: float) -> dict[str, Any]:
-        """Return the section by a plane across the parent axis: curves in the plane, in mm, and diameters.
-
-        Parameters
-        ----------
-        name : treatment to include; None: none.
-        implant : id of the implant whose diameters are returned; None: the first.
-        abscissa_mm : position of the plane along the parent axis.
-        """
-        with LOCK:
-            anatomy = self.anatomy
-            across = self.remembered(("planes", self.case.state.anatomy), lambda: planes(anatomy.parent.axis))
-            at_mm = float(np.clip(abscissa_mm, 0.0, anatomy.parent.axis.length_mm))
-            center, frame = (found[0] for found in across.at(np.array([at_mm])))
-            radius_mm = float(np.interp(at_mm, anatomy.parent.axis.abscissa_mm, anatomy.parent.section_radius_mm))
-            shown = {
-                "abscissa_mm": at_mm,
-                "artery_diameter_mm": 2 * radius_mm,
-                "lumen": _cut(anatomy.vessel.lumen, center, frame),
-                "landing": _cut(anatomy.parent.landing_surface, center, frame),
-            }
-            if name is None:
-                return shown
-            deployed = self.deployed(self.choice(name))
-            rings = [ring for one in deployed.values() if (ring := _ring(one.stent, at_mm, center, frame))]
-            told = deployed.get(implant or "", next(iter(deployed.values())))
-            return shown | {"rings": rings} | _row(told, at_mm)
+    def stop(self) -> None:
+        """End the process."""
+        self._process.kill()
+        self._sender.end()
 
 
-def _one(treatment: Treatment, name: str) -> Implant:
-    """Return an implant of a treatment by its id; ReadError is raised where it has none."""
-    for implant in treatment.implants:
-        if implant.id == name:
-            return implant
-    raise ReadError(f"{name} is not among the implants of {treatment.name}.")
+def work(pipe: Connection, settings: FlowSettings, store: BareFlowStore | None) -> None:
+    """Step the flow until the server ends; the body of the process.
+
+    The pipe receives the anatomy, then (number, stents) for new devices and None for a request; it sends `Reading`.
+    """
+    with suppress(OSError, AttributeError):
+        os.nice(NICE)
+    with suppress(EOFError, BrokenPipeError, OSError, KeyboardInterrupt):
+        try:
+            _Worker(pipe, pipe.recv(), settings, store).run()
+        except VstentError as error:
+            pipe.send(Reading(error=str(error), is_prepared=True))
+            pipe.poll(IDLE_S)
 
 
-def _before(treatment: Treatment, implant: Implant) -> tuple[Implant, ...]:
-    """Return the implants on which the deployment of an implant depends: it is inside of them, or they are."""
-    inside = [_one(treatment, name) for name in implant.inside]
-    return tuple(found for one in inside for found in (*_before(treatment, one), one))
+class _Worker:
+    """The flow and the last message about it."""
 
+    def __init__(self, pipe: Connection, anatomy: Anatomy, settings: FlowSettings, store: BareFlowStore | None) -> None:
+        from vstent.flow.lattice.live import LiveFlow
+        from vstent.flow.problem import flow_case
 
-def _views(anatomy: Anatomy) -> list[View]:
-    """Return the views: the profile around the neck, the whole vessel from the same side, and those of the report."""
-    profile, *others = views_of(anatomy)
-    axis, span = anatomy.parent.axis, _neck_span(anatomy) or [0.0, anatomy.parent.axis.length_mm]
-    is_near = (axis.abscissa_mm > span[0] - BESIDE_MM) & (axis.abscissa_mm < span[1] + BESIDE_MM)
-    sacs = [aneurysm.sac.vertices_mm for aneurysm in anatomy.aneurysms[:1]]
-    treated = np.concatenate([axis.points_mm[is_near], *sacs])
-    whole = view_of("whole", profile.axes, anatomy.vessel.lumen.vertices_mm)
-    return [view_of("profile", profile.axes, treated, 1.15), whole, *others]
+        self.pipe, self.anatomy, self.settings, self.store = pipe, anatomy, settings, store
+        self.serial, self.watched_s, self.drawn_s = 0, -WATCHED_S, 0.0
+        self.left_s, self.reading = PREPARED_S, Reading(fraction=1.0)
+        case = flow_case(anatomy, (), settings)
+        continued = None if store is None else store.load(case)
+        self.is_stored = continued is not None and continued.is_prepared
+        self.live = continued or LiveFlow(case, lambda done: pipe.send(Reading(fraction=done)))
+        pipe.send(self.reading)
 
+    def run(self) -> None:
+        """Step and report while somebody watches; else prepare the flow without a device, store it once, and rest."""
+        while True:
+            newest = None
+            while self.pipe.poll():
+                newest = self.pipe.recv() or newest
+                self.watched_s = time.monotonic()
+            if newest is not None:
+                from vstent.flow.media import media
 
-def _axis(anatomy: Anatomy) -> dict[str, list[float]]:
-    """Return points, abscissa and diameter of the parent axis in mm."""
-    axis = anatomy.parent.axis
-    return {
-        "points": np.round(axis.points_mm, 3).ravel().tolist(),
-        "abscissa": np.round(axis.abscissa_mm, 3).tolist(),
-        "diameter": np.round(2 * anatomy.parent.section_radius_mm, 3).tolist(),
-    }
+                self.serial, stents = newest
+                self.live.place(tuple(medium for stent in stents for medium in media(stent, self.settings.blood)))
+            began = time.perf_counter()
+            if time.monotonic() - self.watched_s < WATCHED_S:
+                steps = self.live.advance(SLICE_S)
+                self._report(steps / (time.perf_counter() - began))
+            elif self.left_s > 0 and not self.live.is_prepared:
+                self.live.prepare(SLICE_S)
+                self.left_s -= time.perf_counter() - began
+            else:
+                if self.store is not None and not self.is_stored:
+                    self.is_stored = True
+                    self.store.save(self.live)
+                self.pipe.send(replace(self.reading, is_prepared=True))
+                if not self.pipe.poll(IDLE_S):
+                    return
+                self.drawn_s = time.monotonic()
 
+    def _report(self, steps_per_s: float) -> None:
+        """Send the present numbers, and from time to time streamlines after them."""
+        bare, now = self.live.bare, self.live.read()
+        if 100 * min(bare.error.values()) > SHOWN_POINTS:
+            self.reading = Reading(self.serial, 1.0)
+            self.pipe.send(self.reading)
+            return
+        points = {key: self.live.change(key)[1] for key in COMPARED}
+        points = {key: value for key, value in points.items() if value < SHOWN_POINTS}
+        values = {
+            "bare_neck_inflow_mL_s": bare.neck_inflow_mL_s,
+            "bare_sac_velocity_m_s": bare.sac_velocity_m_s,
+            "now_neck_inflow_mL_s": now.neck_inflow_mL_s,
+            "now_sac_velocity_m_s": now.sac_velocity_m_s,
+            "grid_spacing_mm": self.live.cell_size_mm,
+            "steps_per_s": steps_per_s,
+        }
+        self.reading = Reading(self.serial, 1.0, values, points, now.is_settled, self.live.is_prepared)
+        self.pipe.send(self.reading)
+        if time.monotonic() - self.drawn_s > (LINES_S if points else 3 * LINES_S):
+            from vstent.flow.streamlines import neck_seeds_mm
 
-def _peak(field: FlowField) -> int | None:
-    """Return the number of the moment of the largest inflow; None for a steady flow."""
-    return max(range(len(field.phases)), key=lambda k: field.phases[k].inflow_mL_s) if field.phases else None
-
-
-def _moments(field: FlowField, moment: int | None) -> dict[str, Any]:
-    """Return the times of all moments in s, and the number of the one shown."""
-    return {"times_s": [phase.time_s for phase in field.phases], "moment": moment if field.phases else None}
-
-
-def _said(opening: Opening) -> dict[str, Any]:
-    """Return role, center, area, diameter and color of an opening."""
-    return {
-        "role": opening.role,
-        "center_mm": opening.center_mm.tolist(),
-        "area_mm2": opening.area_mm2,
-        "diameter_mm": opening.diameter_mm,
-        "colour": [round(255 * part) for part in _opening_colour(opening)],
-    }
-
-
-def _opening_colour(opening: Opening) -> tuple[float, float, float]:
-    """Return the color of an opening."""
-    number = 0 if opening.is_inlet else int(opening.role.rpartition("_")[2])
-    return OPENING_COLOURS[number] if number < len(OPENING_COLOURS) else (0.45, 0.50, 0.54)
-
-
-def _disc(number: int, opening: Opening) -> MeshLayer:
-    """Return a disc with the area of an opening, slightly outside it."""
-    angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
-    first = np.cross(opening.normal, np.eye(3)[np.argmin(np.abs(opening.normal))])
-    first /= np.linalg.norm(first)
-    second = np.cross(opening.normal, first)
-    ring = np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second)
-    center = opening.center_mm + 0.05 * opening.normal
-    points = np.concatenate([center[None], center + 0.5 * opening.diameter_mm * ring])
-    around = np.arange(40)
-    faces = np.stack([np.zeros(40, int), 1 + around, 1 + (around + 1) % 40], axis=1)
-    surface = Surface(points, faces)
-    nothing = np.zeros(0)
-    return MeshLayer(f"opening {number}", "", _opening_colour(opening), "", nothing, surface)
-
-
-def _neck_span(anatomy: Anatomy) -> list[float]:
-    """Return the ends of the neck along the parent axis in mm; empty without a sac."""
-    if not anatomy.aneurysms:
-        return []
-    return list(anatomy.parent.span_mm(anatomy.aneurysms[0]))
-
-
-def _wires(name: str, stent: Stent, gap_mm: Floats, colour: Colour, coverage: Callable[[], Floats]) -> LineLayer:
-    """Return the wires of a device, colored by the values at the nearest nodes (rows, columns)."""
-    of_node = gap_mm
-    if colour == "coverage":
-        of_node = 100 * coverage()
-    elif colour == "diameter":
-        of_node = np.broadcast_to(stent.row_diameter_mm[:, None], gap_mm.shape)
-    some = stent.wire_points_mm[::NEIGHBOURS]
-    near = cKDTree(stent.nodes_mm.reshape(-1, 3)).query(some)[1]
-    values = np.repeat(of_node.ravel()[near], NEIGHBOURS)[: len(stent.wire_points_mm)]
-    return LineLayer(
-        "wires",
-        name,
-        (0.33, 0.38, 0.43),
-        colour,
-        values,
-        stent.wire_points_mm,
-        stent.wire_starts,
-        stent.wire_diameter_um / 2000,
-    )
-
-
-def _formula_coverage(stent: Stent) -> Floats:
-    """Return the metal coverage (rows, columns) by the formula, from the diameter of every row."""
-    of_row = [coverage_fraction(stent.design, stent.size, float(d)) for d in stent.row_diameter_mm]
-    return np.broadcast_to(np.array(of_row)[:, None], stent.nodes_mm.shape[:2])
-
-
-def _center_mm(stent: Stent) -> float:
-    """Return the position of the middle row along the parent axis."""
-    return float(stent.row_abscissa_mm[(len(stent.row_abscissa_mm) - 1) // 2])
-
-
-def _place(found: Sketch, stent: Stent) -> dict[str, Any]:
-    """Return the position of a device, with bands of uncertainty around its ends."""
-    ends = (stent.proximal_abscissa_mm, stent.distal_abscissa_mm)
-    sketched = (found.stent.proximal_abscissa_mm, found.stent.distal_abscissa_mm)
-    bands = [
-        [end + edge - middle for edge in sorted(band)]
-        for end, middle, band in zip(ends, sketched, (found.proximal_band_mm, found.distal_band_mm), strict=True)
-    ]
-    lengths = sorted(b - a for a, b in zip(found.proximal_band_mm, found.distal_band_mm, strict=True))
-    shift = stent.deployed_length_mm - (sketched[1] - sketched[0])
-    return {
-        "device": stent.design.key,
-        "size": stent.size.label,
-        "center_mm": _center_mm(stent),
-        "ends_mm": ends,
-        "ends_band_mm": bands,
-        "profile": np.round(np.stack([stent.row_abscissa_mm, stent.row_diameter_mm], axis=1), 3).tolist(),
-        "length_mm": stent.deployed_length_mm,
-        "length_band_mm": [length + shift for length in lengths],
-    }
-
-
-def _cut(surface: Surface, center: Floats, frame: Floats) -> list[float]:
-    """Return the section of a surface near the axis as segments x1, y1, x2, y2 in the plane."""
-    near = np.linalg.norm(surface.corners_mm[:, 0] - center, axis=1) < SECTION_REACH_MM
-    offset = surface.vertices_mm - center
-    segments = clipping.section(offset, surface.faces[near], offset @ frame[0])
-    return np.round(segments @ frame[1:].T, 3).ravel().tolist()
-
-
-def _row_at(stent: Stent, at_mm: float) -> int | None:
-    """Return the row of a device nearest to a plane across the parent axis; None where the plane misses it."""
-    is_there = stent.proximal_abscissa_mm <= at_mm <= stent.distal_abscissa_mm
-    return int(np.argmin(np.abs(stent.row_abscissa_mm - at_mm))) if is_there else None
-
-
-def _ring(stent: Stent, at_mm: float, center: Floats, frame: Floats) -> list[float]:
-    """Return the section of a device as points x, y in the plane; empty where the plane misses it."""
-    row = _row_at(stent, at_mm)
-    if row is None:
-        return []
-    ring = (stent.nodes_mm[row] - center) @ frame[1:].T
-    return np.round(np.append(ring, ring[:1], axis=0), 3).ravel().tolist()
-
-
-def _row(deployment: Deployment, at_mm: float) -> dict[str, Any]:
-    """Return the diameters and the largest gap of a device at a plane; empty where the plane misses it."""
-    stent = deployment.stent
-    row = _row_at(stent, at_mm)
-    if row is None:
-        return {}
-    return {
-        "device_diameter_mm": float(stent.row_diameter_mm[row]),
-        "free_diameter_mm": float(free_diameters_mm(stent.design, stent.size)[row]),
-        "max_gap_mm": float(deployment.wall_gap_mm[row].max()),
-    }
+            flow, self.drawn_s = self.live.field(), time.monotonic()
+            seeds_mm = neck_seeds_mm(flow, self.anatomy.aneurysms[0].neck, LINES)
+            self.pipe.send(replace(self.reading, lines=stream_layer("", flow, seeds_mm)))

@@ -8,14 +8,12 @@ from vstent.app.choices import NECK_HANDLES
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Floats
-from vstent.reporting.scene import LineLayer, curves_layer
+from vstent.reporting.scene import NECK_COLOUR, LineLayer, closed_layer
 
 POINTS: Final = 96
 """Number of points of a neck on the page."""
 REACH: Final = 1.5
 """Distance from a dragged handle within which the curve moves too, in handle spacings."""
-_DRAWN: Final = (0.72, 0.20, 0.16)
-"""Color of a neck: red, green and blue, 0 to 1."""
 
 
 def curve_of(anatomy: Anatomy) -> Floats:
@@ -50,7 +48,7 @@ def pulled(anatomy: Anatomy, curve_mm: Floats, handle: int, to_mm: Floats) -> Fl
 
 def layer_of(curve_mm: Floats) -> LineLayer:
     """Return a neck (n, 3) as a layer that replaces the one in the scene."""
-    return curves_layer("neck", [np.concatenate([curve_mm, curve_mm[:1]])], 0.08, _DRAWN)
+    return closed_layer("neck", [curve_mm], 0.08, NECK_COLOUR)
 
 
 def told(curve_mm: Floats) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from vstent.app.planes import Grid
+from vstent.app.scans import Grid
 from vstent.devices.stent import Stent
 from vstent.geometry.image import Image
 from vstent.geometry.surface import Surface
@@ -22,10 +22,16 @@ def outlines(image: Image | Grid, anatomy: Anatomy, stents: Sequence[Stent], axi
     axis crosses the plane.
     """
     packer = Packer()
+    surfaces = {
+        "lumen": [anatomy.vessel.lumen],
+        "parent": [anatomy.parent.landing_surface],
+        "sac": [aneurysm.sac for aneurysm in anatomy.aneurysms],
+        "neck": [aneurysm.neck for aneurysm in anatomy.aneurysms],
+    }
     curves = {
-        name: packer.add_numbers(np.concatenate([section(image, one, axis, index) for one in surfaces]).reshape(-1, 4))
-        for name, surfaces in _surfaces(anatomy).items()
-        if surfaces
+        name: packer.add_numbers(np.concatenate([section(image, one, axis, index) for one in some]).reshape(-1, 4))
+        for name, some in surfaces.items()
+        if some
     }
     told: dict[str, Any] = {"segments": curves}
     if stents:
@@ -33,41 +39,15 @@ def outlines(image: Image | Grid, anatomy: Anatomy, stents: Sequence[Stent], axi
     return packer.framed(told)
 
 
-def _surfaces(anatomy: Anatomy) -> dict[str, list[Surface]]:
-    """Return the surfaces that are cut, by the name of their outline."""
-    return {
-        "lumen": [anatomy.vessel.lumen],
-        "parent": [anatomy.parent.landing_surface],
-        "sac": [aneurysm.sac for aneurysm in anatomy.aneurysms],
-        "neck": [aneurysm.neck for aneurysm in anatomy.aneurysms],
-    }
-
-
 def section(image: Image | Grid, surface: Surface, axis: int, index: int) -> Floats:
-    """Return the segments (s, 2, 2) in which the plane of a slice cuts a surface, as voxel indices in the slice.
-
-    Parameters
-    ----------
-    image : the scan, or another grid of its slices.
-    surface : the surface.
-    axis : voxel axis across the slice.
-    index : voxel index along that axis.
-    """
+    """Return the segments (s, 2, 2) in which the plane of a slice cuts a surface, as voxel indices in the slice."""
     place = image.to_index(surface.vertices_mm)
     found = clipping.section(place, surface.faces, place[:, axis] - index)
     return np.delete(found, axis, axis=2)
 
 
 def crossings(image: Image | Grid, stent: Stent, axis: int, index: int) -> Floats:
-    """Return where wires cross the plane of a slice (n, 3): column, row and diameter of the wire in mm.
-
-    Parameters
-    ----------
-    image : the scan, or another grid of its slices.
-    stent : device with wires.
-    axis : voxel axis across the slice.
-    index : voxel index along that axis.
-    """
+    """Return where wires cross the plane of a slice (n, 3): column, row and diameter of the wire in mm."""
     place = image.to_index(stent.wire_points_mm)
     offset, first = place[:, axis] - index, stent.piece_starts
     first = first[(offset[first] > 0) != (offset[first + 1] > 0)]

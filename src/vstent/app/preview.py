@@ -1,390 +1,562 @@
-"""Live flow of a case, in a process of its own that steps while the page watches.
+"""Answer the page immediately, from the results that a case has so far."""
 
-The process first prepares the flow without a device, for a limited time, and stores it in the case folder. After that
-it only steps while somebody asks for its numbers. It leaves the processor to everything else that the page does. It
-ends when the server does, or when nobody has asked for some minutes.
-"""
-
-import os
-import time
-from collections import deque
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from multiprocessing import get_context
-from multiprocessing.connection import Connection
+from dataclasses import replace
+from datetime import date
+from functools import partial
 from pathlib import Path
-from threading import Condition, Lock, Thread
-from typing import TYPE_CHECKING, Final
+from typing import Any, Final, Literal, TypeVar, cast
 
-from vstent.children import spawning
-from vstent.devices.stent import Stent
-from vstent.errors import InputError, VstentError
-from vstent.flow.case import FlowCase
+import numpy as np
+from scipy.spatial import cKDTree
+
+from vstent.anatomy.morphology import Measures, morphology
+from vstent.angiography.history import History
+from vstent.angiography.view import angles_of
+from vstent.angiography.working_projection import working_projection
+from vstent.app import necks, sheets
+from vstent.app.cases import Case
+from vstent.app.cuts import cut
+from vstent.app.films import films_message, kept_curves
+from vstent.app.finished import kept_flows, kept_histories
+from vstent.deployment.contour import planes
+from vstent.deployment.deploy import propose_landing
+from vstent.deployment.measure import measure
+from vstent.deployment.method import laid_inside
+from vstent.deployment.sketch import Bed, Sketch, bed, sketch
+from vstent.devices.catalogue import find_design
+from vstent.devices.formulas import coverage_fraction, free_diameters_mm
+from vstent.devices.stent import Deployment, Landing, Stent
+from vstent.devices.treatment import BARE, Implant, Treatment
+from vstent.errors import InputError, ReadError, VstentError
+from vstent.flow.case import FlowField
+from vstent.flow.domain import default_cell_size_mm
+from vstent.flow.problem import vessel_case
 from vstent.flow.settings import FlowSettings
-from vstent.geometry.vessel import Anatomy
-from vstent.io.archive import DAMAGE
+from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Anatomy, Opening
+from vstent.io.archive import load_data
+from vstent.kernels import clipping
+from vstent.kernels.arrays import Floats
 from vstent.reporting.packing import message
-from vstent.reporting.scene import LineLayer, scales_of, stream_layer
-from vstent.study.keys import key_of
-from vstent.study.store import Key, Store
+from vstent.reporting.scene import (
+    STEEL_COLOUR,
+    LineLayer,
+    MeshLayer,
+    anatomy_layers,
+    contour_layer,
+    flow_layers,
+    implant_titles,
+    node_coverage,
+    scales_of,
+    treatment_title,
+    view_of,
+    views_of,
+)
+from vstent.reporting.uncertainty import band_rows, how_sure
+from vstent.study.folder import CACHE
+from vstent.study.stages import bands_of, deploy_implant, landing_of, on_path, size_of
 
-if TYPE_CHECKING:  # imported by the process, so that the server does not wait for it
-    from vstent.flow.lattice.live import LiveFlow
+Colour = Literal["wall_gap", "coverage", "diameter"]
+"""Quantity that colors the wires."""
+Found = TypeVar("Found")
 
-Stents = tuple[Stent, ...]
-"""Devices of a treatment in the order of their deployment."""
-
-NICE: Final = 10
-"""Priority of the process, below that of the server."""
-SLICE_S: Final = 0.15
-"""Time between two messages of the process, in s."""
-LINES_S: Final = 0.5
-"""Time between two sets of streamlines, in s; three times as long until a number has a band, which comes sooner so."""
-WATCHED_S: Final = 2.0
-"""Time after the last request for which the process goes on stepping, in s."""
-PREPARED_S: Final = 60.0
-"""Longest time for which the flow without a device is computed while nobody watches, in s."""
-IDLE_S: Final = 600.0
-"""Time without a request after which the process ends and frees its memory, in s."""
-FREE_BYTES: Final = 2e9
-"""Free memory below which nothing is computed in advance, in bytes; the process of C0038 takes 0.5 GB."""
-STORED: Final = "live"
-"""Name under which the flow without a device is stored."""
-STALE_S: Final = 1.5
-"""Age of the last message from which it counts as stale, in s."""
-HISTORY: Final = 240
-"""Number of readings that the chart shows."""
-LINES: Final = 70
-"""Number of streamlines through the neck."""
-ERROR_POINTS: Final = 8.0
-"""Largest difference of a reduction from that of a full computation, once it is averaged long enough, in percentage
-points; the largest one measured is 6 (`benchmarks/live.py`)."""
-SHOWN_POINTS: Final = 30.0
-"""Uncertainty of the averages in percentage points above which a reduction is shown without a band."""
-
-
-@dataclass(frozen=True, eq=False)
-class Said:
-    """The last message of the process."""
-
-    serial: int = 0
-    """Number of the device that the numbers belong to; 0: the flow without a device."""
-    fraction: float = 0.0
-    """Part of the flow without a device that is computed."""
-    values: dict[str, float] = field(default_factory=dict)
-    """Neck inflow (mL/s) and sac velocity (m/s), without a device and now, and the steps per second; empty as long as
-    they are not known well enough to be shown."""
-    points: dict[str, float] = field(default_factory=dict)
-    """Uncertainty of the averages behind every reduction, in percentage points, where it is known."""
-    is_settled: bool = False
-    """Whether the last readings agree."""
-    is_prepared: bool = False
-    """Whether nothing is left to compute in advance."""
-    error: str = ""
-    """Why it cannot be computed."""
-    lines: LineLayer | None = None
-    """Streamlines through the neck; None: unchanged."""
-
-
-class _Post:
-    """Sends to the process from a thread of its own: the anatomy first, then of what waits only the newest.
-
-    An anatomy or a device is larger than the buffer of a pipe, so sending it takes until the process reads it. Whoever
-    draws the device must not wait for that.
-    """
-
-    def __init__(self, pipe: Connection, anatomy: Anatomy) -> None:
-        self._pipe, self._ready, self._anatomy = pipe, Condition(), anatomy
-        self._device: tuple[int, Stents] | None = None
-        self._is_asked = self._is_over = False
-        Thread(target=self._run, daemon=True).start()
-
-    def put(self, device: tuple[int, Stents] | None) -> None:
-        """Send the devices with their number, or None as a request to go on, as soon as the process reads."""
-        with self._ready:
-            self._device, self._is_asked = device or self._device, True
-            self._ready.notify()
-
-    def end(self) -> None:
-        """Close the pipe."""
-        with self._ready:
-            self._is_over = True
-            self._ready.notify()
-
-    def _run(self) -> None:
-        """Send until the end, or until the process has ended."""
-        with suppress(OSError):
-            self._pipe.send(self._anatomy)
-            while True:
-                with self._ready:
-                    self._ready.wait_for(lambda: self._is_asked or self._is_over)
-                    if self._is_over:
-                        break
-                    device, self._device, self._is_asked = self._device, None, False
-                self._pipe.send(device)
-        self._pipe.close()
-
-
-@dataclass(frozen=True)
-class Shelf:
-    """Where the flow without a device is stored."""
-
-    folder: Path
-    """Cache folder of the case."""
-    key: Key
-    """Key of the flow."""
-
-
-def shelf_of(folder: Path, anatomy: str, settings: FlowSettings) -> Shelf:
-    """Return where the flow without a device is stored for an anatomy of this key and settings of the flow."""
-    return Shelf(folder, key_of("vstent.flow.lattice.live", anatomy, settings, without=("vstent.deployment",)))
+LOCK: Final = threading.RLock()
+"""Lock for one computation at a time, because parallel compiled loops must not run concurrently."""
+CACHED: Final = 40
+"""Number of results cached per case."""
+SECTION_REACH_MM: Final = 9.0
+"""Distance from the axis within which a section shows surfaces, in mm."""
+BESIDE_MM: Final = 8.0
+"""Length of artery on each side of the neck that the profile view shows, in mm."""
+NEIGHBOURS: Final = 3
+"""Number of consecutive wire points that have the color of one node, the nearest to the first of them."""
+OPENING_COLOURS: Final = (
+    (0.00, 0.45, 0.70),
+    (0.90, 0.62, 0.00),
+    (0.00, 0.62, 0.45),
+    (0.80, 0.47, 0.65),
+    (0.34, 0.71, 0.91),
+)
+"""Okabe and Ito's colors, distinguishable with color vision deficiency; inlets have the first."""
 
 
 class Preview:
-    """Live flow of one anatomy.
+    """Results of one case, loaded or computed on demand, and cached."""
 
-    Parameters
-    ----------
-    anatomy : vessel with a sac.
-    settings : settings of the flow; a preview is steady.
-    shelf : where the flow without a device is stored; None: nowhere.
+    def __init__(self, case: Case) -> None:
+        self.case = case
+        self.shown: tuple[Stent, ...] = ()  # the devices that were drawn last
+        self._follow: Callable[[tuple[Stent, ...]], None] | None = None
+        self._cache: dict[Hashable, Any] = {}
 
-    Raises
-    ------
-    InputError
-        The vessel has no sac.
-    """
+    def _cached(self, key: Hashable, compute: Callable[[], Found]) -> Found:
+        """Return the cached result of a key; where there is none, compute and cache it."""
+        with LOCK:
+            if key not in self._cache:
+                result = compute()
+                while len(self._cache) >= CACHED:
+                    self._cache.pop(next(iter(self._cache)))
+                self._cache[key] = result
+            return cast("Found", self._cache[key])
 
-    def __init__(self, anatomy: Anatomy, settings: FlowSettings, shelf: Shelf | None = None) -> None:
-        if not anatomy.aneurysms:
-            raise InputError("Live flow needs a sac, and none was found. Choose one in the step Sac and parent.")
-        self.anatomy, self.settings, self.shelf = anatomy, settings, shelf
-        self._lock, self._serial = Lock(), 0
-        self._stents: Stents | None = None
-        self._watched_s = -WATCHED_S
-        self._begin()
+    def _loaded(self, path: Path, kind: type[Found]) -> Found:
+        """Return the content of a file of a study, read again where the file has changed."""
+        return self._cached((kind, path, path.stat().st_mtime_ns), lambda: load_data(path, kind))
 
-    def _begin(self) -> None:
-        """Start the process."""
-        self._said, self._at_s, self._sent = Said(), time.monotonic(), 0
-        self._lines: LineLayer | None = None
-        self._drawn = 0
-        self._history: deque[float] = deque(maxlen=HISTORY)
-        context = get_context("spawn")
-        self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=work, args=(theirs, self.settings, self.shelf), daemon=True)
-        with spawning():
-            self._process.start()
-        theirs.close()
-        self._post = _Post(self._pipe, self.anatomy)
-        Thread(target=self._follow, args=(self._pipe,), daemon=True).start()
+    @property
+    def anatomy(self) -> Anatomy:
+        """Last anatomy found.
 
-    def _revive(self) -> None:
-        """Start the process again where it had begun to step; else say that it ends at once."""
-        if self._said.fraction >= 1.0:
-            self._post.end()
-            self._begin()
-        else:
-            self._said = Said(
-                error="The live flow ended unexpectedly. Switch it on again, or run the step Flow instead."
+        Raises
+        ------
+        ReadError
+            There is no anatomy yet.
+        """
+        key = self.case.state.anatomy
+        path = self.case.folder / CACHE / f"anatomy-{key}.npz"
+        if not key:
+            raise ReadError("The vessel has not been found yet. Run the first three steps.")
+        return self._cached(("anatomy", key), lambda: load_data(path, Anatomy))
+
+    def choice(self, name: str) -> Treatment:
+        """Return a chosen treatment by its name.
+
+        Raises
+        ------
+        ReadError
+            It is not chosen.
+        """
+        for treatment in self.case.state.choices.treatments:
+            if treatment.name == name:
+                return treatment
+        raise ReadError(f"{name} is not among the chosen treatments.")
+
+    def _bed(self, implant: Implant) -> Bed:
+        """Return the artery prepared for an implant of the chosen size."""
+        path, asked = implant.placing.path, (implant.device, implant.diameter_mm, implant.length_mm)
+
+        def prepare() -> Bed:
+            anatomy = on_path(self.anatomy, path)
+            return bed(find_design(implant.device), size_of(implant, anatomy), anatomy)
+
+        return self._cached(("bed", self.case.state.anatomy, path, *asked), prepare)
+
+    def _of_implant(self, what: str, treatment: Treatment, implant: Implant, compute: Callable[[], Found]) -> Found:
+        """Return a cached result of a deployed implant; where there is none, compute and cache it."""
+        return self._cached((what, self.case.state.anatomy, *_before(treatment, implant), implant), compute)
+
+    def deployment(self, treatment: Treatment, implant: Implant) -> Deployment:
+        """Return a deployed implant; those that it opens inside are deployed before it."""
+
+        def deploy() -> Deployment:
+            inside = [self.deployment(treatment, _implant(treatment, name)).stent for name in implant.inside]
+            return deploy_implant(implant, self.anatomy, inside)
+
+        return self._of_implant("deployment", treatment, implant, deploy)
+
+    def deployed(self, treatment: Treatment) -> dict[str, Deployment]:
+        """Return the deployed implants of a treatment by id."""
+        return {implant.id: self.deployment(treatment, implant) for implant in treatment.implants}
+
+    def stents(self, treatment: Treatment) -> tuple[Stent, ...]:
+        """Return the devices of a deployed treatment in their order."""
+        return tuple(one.stent for one in self.deployed(treatment).values())
+
+    def _measures(self, treatment: Treatment, implant: Implant) -> Measures:
+        """Return the measures of a deployed implant."""
+        return self._of_implant(
+            "measures", treatment, implant, lambda: measure(self.anatomy, self.deployment(treatment, implant))
+        )
+
+    def _metrics(self, treatment: Treatment, implant: Implant) -> dict[str, Any]:
+        """Return the measures of a deployed implant with its bands, as in the metrics of a study."""
+
+        def compute() -> dict[str, Any]:
+            measures, deployment = self._measures(treatment, implant), self.deployment(treatment, implant)
+            return measures | {"bands": bands_of(self.anatomy, deployment, measures, implant)}
+
+        return self._of_implant("metrics", treatment, implant, compute)
+
+    def _wires(self, pane: str, treatment: Treatment, colour: Colour, but: str = "") -> list[LineLayer]:
+        """Return the wires of the deployed implants of a treatment, without those of the implant `but`."""
+        layers = []
+        for implant in treatment.implants:
+            if implant.id != but:
+                found = self.deployment(treatment, implant)
+                measured = partial(node_coverage, found.stent)
+                coverage = partial(self._of_implant, "coverage", treatment, implant, measured)
+                layers.append(_wires(pane, found.stent, found.wall_gap_mm, colour, coverage))
+        return layers
+
+    def _drawn(self, pane: str, treatment: Treatment, colour: Colour) -> list[MeshLayer | LineLayer]:
+        """Return wires and contours of a deployed treatment in a pane."""
+        contours = [contour_layer(pane, one, self.anatomy) for one in self.deployed(treatment).values()]
+        return [*self._wires(pane, treatment, colour), *contours]
+
+    def _sheets(self, treatment: Treatment) -> list[dict[str, Any]]:
+        """Return the tables of the deployed implants of a treatment."""
+        titles = implant_titles(self.deployed(treatment))
+        return [sheets.device(titles[one.id], self._measures(treatment, one)) for one in treatment.implants]
+
+    def bands_sheet(self, treatment: Treatment, implant: str) -> dict[str, Any]:
+        """Return the bands of a deployed implant as the page shows them."""
+        with LOCK:
+            metrics = self._metrics(treatment, _implant(treatment, implant))
+        told = {"treatment": treatment.name, "implant": implant}
+        return told | {"sentence": how_sure(metrics), "rows": band_rows(metrics)}
+
+    def follow(self, take: Callable[[tuple[Stent, ...]], None] | None) -> None:
+        """Hand the devices that are drawn, and all later ones, to the live flow; None: to nobody."""
+        self._follow = take
+        if take is not None and self.shown:
+            take(self.shown)
+
+    def _show(self, stents: tuple[Stent, ...]) -> None:
+        """Note the devices that are drawn, and tell the live flow."""
+        self.shown = stents
+        if self._follow is not None:
+            self._follow(stents)
+
+    def _flow_layers(self, name: str, path: Path, moment: int | None) -> list[MeshLayer | LineLayer]:
+        """Return the layers of a flow, with its cut: of its mean, or of one moment of its last cycle."""
+
+        def draw() -> list[MeshLayer | LineLayer]:
+            flow = self._loaded(path, FlowField)
+            shown = flow if moment is None or not flow.phases else flow.at_phase(flow.phases[moment % len(flow.phases)])
+            return [*flow_layers(name, shown, self.anatomy), cut(name, shown, self.anatomy)]
+
+        return self._cached(("layers", path, path.stat().st_mtime_ns, self.case.state.anatomy, moment), draw)
+
+    def plan(self) -> bytes:
+        """Return the plan of the chosen treatments as PDF, one page per implant.
+
+        Raises
+        ------
+        InputError
+            No device is chosen, or one does not fit.
+        """
+        from vstent.reporting.plan_sheet import Planned, plan_pdf
+
+        state, day = self.case.state, date.today().isoformat()
+        chosen = state.choices.treatments
+        if not chosen:
+            raise InputError("No device is chosen. Choose one in the step Device.")
+        with LOCK:
+            found = {one.name: self.deployed(one) for one in chosen}
+            metrics = {one.name: {part.id: self._metrics(one, part) for part in one.implants} for one in chosen}
+            return plan_pdf(Planned(state.name, self.anatomy, found, metrics, state.source, day))
+
+    # -- messages for the page -----------------------------------------------------------------------------------------
+
+    def anatomy_message(self) -> bytes:
+        """Return vessel, openings, sac, neck, parent artery and axis with their numbers, as a message for the page."""
+        anatomy = self.anatomy
+        axis, openings = anatomy.parent.axis, anatomy.vessel.openings
+        radius_mm = anatomy.parent.section_radius_mm
+        span_mm = list(anatomy.parent.span_mm(anatomy.aneurysms[0])) if anatomy.aneurysms else []
+        # The profile shows the artery around the neck, the view of the whole vessel is from the same side.
+        profile, *others = views_of(anatomy)
+        low_mm, high_mm = span_mm or (0.0, axis.length_mm)
+        is_near = (axis.abscissa_mm > low_mm - BESIDE_MM) & (axis.abscissa_mm < high_mm + BESIDE_MM)
+        treated = np.concatenate([axis.points_mm[is_near], *(one.sac.vertices_mm for one in anatomy.aneurysms[:1])])
+        whole = view_of("whole", profile.axes, anatomy.vessel.lumen.vertices_mm)
+        return message(
+            [*anatomy_layers(anatomy), *(_disc(k, opening) for k, opening in enumerate(openings))],
+            views=[view_of("profile", profile.axes, treated, 1.15), whole, *others],
+            fade=1.2 * float(np.median(radius_mm)),
+            axis={
+                "points": np.round(axis.points_mm, 3).ravel().tolist(),
+                "abscissa": np.round(axis.abscissa_mm, 3).tolist(),
+                "diameter": np.round(2 * radius_mm, 3).tolist(),
+            },
+            is_oriented=anatomy.vessel.is_oriented,
+            openings=[
+                {
+                    "role": opening.role,
+                    "center_mm": opening.center_mm.tolist(),
+                    "area_mm2": opening.area_mm2,
+                    "diameter_mm": opening.diameter_mm,
+                    "colour": [round(255 * part) for part in _opening_colour(opening)],
+                }
+                for opening in openings
+            ],
+            notes=[*anatomy.vessel.notes, *anatomy.notes],
+            neck=span_mm,
+            drawn=necks.told(necks.curve_of(anatomy)),
+        )
+
+    def neck_message(self, curve_mm: Floats, handle: int | None, to_mm: Floats | None) -> bytes:
+        """Return a neck with its area, optionally with one handle moved to a point of the wall.
+
+        Shapes: `curve_mm` (n, 3), `to_mm` (3,).
+        """
+        with LOCK:
+            if handle is not None and to_mm is not None:
+                curve_mm = necks.pulled(self.anatomy, curve_mm, handle, to_mm)
+            return message([necks.layer_of(curve_mm)], neck=necks.told(curve_mm))
+
+    def anatomy_sheet(self) -> list[dict[str, Any]]:
+        """Return the metrics of the anatomy."""
+        measures = self._cached(("morphology", self.case.state.anatomy), lambda: morphology(self.anatomy))
+        return sheets.anatomy(measures)
+
+    def proposed(self) -> dict[str, Any]:
+        """Return the values that the study proposes where none is chosen: inflow, grid spacing and device sizes."""
+        devices = dict.fromkeys(key for one in self.case.state.choices.treatments for key in one.devices)
+
+        def propose() -> dict[str, Any]:
+            given = self.case.state.former_settings().flow or FlowSettings()
+            numerics = replace(given.numerics, cell_size_mm=None)
+            case = vessel_case(self.anatomy.vessel, replace(given, inflow_mL_s=None, numerics=numerics))
+            sizes = {}
+            for key in devices:
+                with suppress(VstentError):
+                    sizes[key] = size_of(Implant(key, key), self.anatomy).label
+            return {"inflow_mL_s": case.inflow_mL_s, "cell_size_mm": default_cell_size_mm(case), "sizes": sizes}
+
+        return self._cached(("proposed", self.case.state.anatomy, *devices), propose)
+
+    def sketch_message(self, treatment: Treatment, implant: str, landing: Landing | None, colour: Colour) -> bytes:
+        """Return the wires of an implant at its expected position, with the others of its treatment as deployed.
+
+        The implant is drawn as if it opened against the wall of the artery, at a landing; None: at the chosen one, or
+        at the proposed one where none is chosen.
+        """
+        with LOCK:
+            pane, chosen = treatment.name, _implant(treatment, implant)
+            wall, anatomy = self._bed(chosen), on_path(self.anatomy, chosen.placing.path)
+            landing = landing or landing_of(chosen, anatomy, wall.size)
+            if landing is None:
+                found = laid_inside(partial(sketch, wall), propose_landing(wall.design, anatomy, wall.size))
+            else:
+                found = sketch(wall, landing)
+            others = {one.id: self.deployment(treatment, one).stent for one in treatment.implants if one.id != implant}
+            self._show(tuple(others.get(one.id, found.stent) for one in treatment.implants))
+            wires = _wires(pane, found.stent, found.gap_mm, colour, lambda: _formula_coverage(found.stent))
+            layers = [wires, *self._wires(pane, treatment, colour, but=implant)]
+            place = _place(found, found.stent)
+            return message(layers, scales_of(layers, self.anatomy), treatment=pane, implant=implant, **place)
+
+    def deployment_message(self, treatment: Treatment, implant: str, colour: Colour) -> bytes:
+        """Return a deployed treatment with its expansion and its metrics, and the place of one of its implants."""
+        with LOCK:
+            chosen, deployed = _implant(treatment, implant), self.deployed(treatment)
+            stent = deployed[implant].stent
+            self._show(self.stents(treatment))
+            layers = self._drawn(treatment.name, treatment, colour)
+            landing = landing_of(chosen, on_path(self.anatomy, chosen.placing.path), stent.size)
+            found = laid_inside(partial(sketch, self._bed(chosen)), landing or Landing(_center_mm(stent)))
+            return message(
+                layers,
+                scales_of(layers, self.anatomy),
+                treatment=treatment.name,
+                implant=implant,
+                **_place(found, stent),
+                title=treatment_title(deployed),
+                advice=deployed[implant].advice,
+                measures=self._sheets(treatment),
             )
 
-    def _follow(self, pipe: Connection) -> None:
-        """Keep the last message of the process until it ends."""
-        with suppress(EOFError, OSError):
-            while True:
-                said = pipe.recv()
-                with self._lock:
-                    self._said, self._at_s = said, time.monotonic()
-                    if said.lines is not None:
-                        self._lines, self._drawn = said.lines, self._drawn + 1
-                    if "now_neck_inflow_mL_s" in said.values:
-                        self._history.append(_reduction(said.values, "neck_inflow_mL_s"))
+    def comparison_message(self, treatments: Sequence[Treatment], colour: Colour) -> bytes:
+        """Return several deployed treatments, each in a pane of its own, on common color scales."""
+        with LOCK:
+            layers: list[MeshLayer | LineLayer] = []
+            told = []
+            for number, treatment in enumerate(treatments):
+                pane, title = f"compared {number}", treatment_title(self.deployed(treatment))
+                layers += self._drawn(pane, treatment, colour)
+                told.append({"pane": pane, "title": title, "measures": self._sheets(treatment)})
+            return message(layers, scales_of(layers, self.anatomy), compared=told)
 
-    @property
-    def is_watched(self) -> bool:
-        """Whether somebody has asked for the numbers a short time ago."""
-        return time.monotonic() - self._watched_s < WATCHED_S
+    def flow_message(self, moment: int | None) -> bytes:
+        """Return wall shear stress, streamlines and a cut of every flow, on common color scales.
 
-    @property
-    def is_preparing(self) -> bool:
-        """Whether the process computes although nobody watches."""
-        return not self.is_watched and not self._said.is_prepared and self._process.is_alive()
+        Raises
+        ------
+        ReadError
+            Flows are missing.
+        """
+        with LOCK:
+            paths = kept_flows(self.case.folder)
+            if not paths:
+                raise ReadError("Some flows of these results are missing. Run the step Flow.")
+            layers = [layer for name, path in paths.items() for layer in self._flow_layers(name, path, moment)]
+            of_scales, phases = layers, self._loaded(next(iter(paths.values())), FlowField).phases
+            if moment is not None and phases:  # all moments have the scales of that of the largest inflow
+                most = max(range(len(phases)), key=lambda k: phases[k].inflow_mL_s)
+                of_scales = self._flow_layers(BARE, paths[BARE], most)
+            return message(
+                layers,
+                scales_of(of_scales, self.anatomy),
+                times_s=[phase.time_s for phase in phases],
+                moment=moment if phases else None,
+                panes=list(paths),
+            )
 
-    def place(self, stents: Stents) -> None:
-        """Put the devices of a treatment into the flow in place of the last ones; unwatched they are only noted."""
-        with self._lock:
-            self._serial += 1
-            self._stents = stents
-        if self.is_watched:
-            self._send()
+    def films_message(self, direction: str, *, has_wires: bool = False, moment: int | None = None) -> bytes:
+        """Return the films of every flow along one direction; empty: along the working projection.
 
-    def _send(self) -> None:
-        """Send the devices where the process does not have them, else the request to go on."""
-        with self._lock:
-            is_new, self._sent = self._sent != self._serial, self._serial
-            device = (self._serial, self._stents) if is_new and self._stents is not None else None
-        self._post.put(device)
+        Raises
+        ------
+        ReadError
+            The angiogram has not been computed.
+        """
+        with LOCK:
+            paths = kept_histories(self.case.folder)
+            if not paths:
+                raise ReadError("The angiogram has not been computed for these flows. Compute it in the step Flow.")
+            histories = {name: self._loaded(path, History) for name, path in paths.items()}
+            chosen = {one.name: one for one in self.case.state.choices.treatments if has_wires}
+            stents = {name: self.stents(chosen[name]) for name in histories if name in chosen}
+            key = ("direction", self.case.state.anatomy)
+            proposed = partial(self._cached, key, lambda: working_projection(self.anatomy))
+            angles = angles_of(direction) if direction else proposed()
+            curves = kept_curves(self.case.folder) if moment is None else None
+            return films_message(histories, angles, stents=stents, moment=moment, curves=curves)
 
-    def message(self, seen: int = 0) -> bytes:
-        """Return the numbers and new streamlines as a message for the page; the process goes on for a while.
+    def section(self, name: str | None, implant: str | None, abscissa_mm: float) -> dict[str, Any]:
+        """Return the section by a plane across the parent axis: curves in the plane, in mm, and diameters.
 
         Parameters
         ----------
-        seen : number of the streamlines that the page has; they are not sent again. 0: none.
+        name : treatment to include; None: none.
+        implant : id of the implant whose diameters are returned; None: the first.
+        abscissa_mm : position of the plane along the parent axis.
         """
-        if not self._process.is_alive() and not self._said.error:
-            self._revive()
-        self._watched_s = time.monotonic()
-        self._send()
-        with self._lock:
-            said, age_s, lines, drawn = self._said, time.monotonic() - self._at_s, self._lines, self._drawn
-            history = list(self._history)
-        layers = [] if lines is None or drawn == seen else [lines]
-        return message(
-            layers,
-            scales_of(layers, self.anatomy),
-            drawn=drawn,
-            fraction=said.fraction,
-            error=said.error,
-            is_settled=said.is_settled,
-            is_stale=said.serial != self._serial or age_s > STALE_S,
-            values=said.values,
-            reductions={key: _reduction(said.values, key) for key in _KEYS if f"now_{key}" in said.values},
-            history=history,
-            error_points={key: ERROR_POINTS + points for key, points in said.points.items()},
-        )
-
-    def stop(self) -> None:
-        """End the process."""
-        self._process.kill()
-        self._post.end()
-
-
-_KEYS: Final = ("neck_inflow_mL_s", "sac_velocity_m_s")
-"""Names of the values that the page compares with the flow without a device."""
-
-
-def _reduction(values: dict[str, float], key: str) -> float:
-    """Return the relative change of a value against the flow without a device, in percent."""
-    return 100 * (values[f"now_{key}"] / max(values[f"bare_{key}"], 1e-12) - 1)
+        with LOCK:
+            anatomy = self.anatomy
+            across = self._cached(("planes", self.case.state.anatomy), lambda: planes(anatomy.parent.axis))
+            at_mm = float(np.clip(abscissa_mm, 0.0, anatomy.parent.axis.length_mm))
+            center, frame = (found[0] for found in across.at(np.array([at_mm])))
+            radius_mm = float(np.interp(at_mm, anatomy.parent.axis.abscissa_mm, anatomy.parent.section_radius_mm))
+            shown = {
+                "abscissa_mm": at_mm,
+                "artery_diameter_mm": 2 * radius_mm,
+                "lumen": _section(anatomy.vessel.lumen, center, frame),
+                "landing": _section(anatomy.parent.landing_surface, center, frame),
+            }
+            if name is None:
+                return shown
+            deployed, rings = self.deployed(self.choice(name)), []
+            rows = {key: _row_at(one.stent, at_mm) for key, one in deployed.items()}
+            for key, row in rows.items():
+                if row is not None:
+                    ring = (deployed[key].stent.nodes_mm[row] - center) @ frame[1:].T
+                    rings.append(np.round(np.append(ring, ring[:1], axis=0), 3).ravel().tolist())
+            shown_id = implant if implant and implant in deployed else next(iter(deployed))
+            at_row, stent = rows[shown_id], deployed[shown_id].stent
+            if at_row is None:
+                return shown | {"rings": rings}
+            return shown | {
+                "rings": rings,
+                "device_diameter_mm": float(stent.row_diameter_mm[at_row]),
+                "free_diameter_mm": float(free_diameters_mm(stent.design, stent.size)[at_row]),
+                "max_gap_mm": float(deployed[shown_id].wall_gap_mm[at_row].max()),
+            }
 
 
-def work(pipe: Connection, settings: FlowSettings, shelf: Shelf | None) -> None:
-    """Step the flow until the server ends; the body of the process.
-
-    Parameters
-    ----------
-    pipe : receives the anatomy, then (number, stents) for new devices and None for a request; sends `Said`.
-    settings : settings of the flow.
-    shelf : where the flow without a device is stored; None: nowhere.
-    """
-    with suppress(OSError, AttributeError):
-        os.nice(NICE)
-    with suppress(EOFError, BrokenPipeError, OSError, KeyboardInterrupt):
-        try:
-            _Worker(pipe, pipe.recv(), settings, _Store(shelf)).run()
-        except VstentError as error:
-            pipe.send(Said(error=str(error), is_prepared=True))
-            pipe.poll(IDLE_S)
+def _implant(treatment: Treatment, name: str) -> Implant:
+    """Return an implant of a treatment by its id; ReadError is raised where it has none."""
+    for implant in treatment.implants:
+        if implant.id == name:
+            return implant
+    raise ReadError(f"{name} is not among the implants of {treatment.name}.")
 
 
-class _Store:
-    """The stored flow without a device; a file that cannot be read or written only costs run time."""
-
-    def __init__(self, shelf: Shelf | None) -> None:
-        self.shelf = shelf
-        self._is_current = shelf is None
-
-    def begin(self, case: FlowCase, told: Callable[[float], None]) -> "LiveFlow":
-        """Return the live flow of a case, continued from the stored one where there is one."""
-        from vstent.flow.lattice.live import BareFlow, LiveFlow
-
-        stored = None if self.shelf is None else Store(self.shelf.folder).load(STORED, self.shelf.key, BareFlow)
-        if stored is not None:
-            with suppress(*DAMAGE):
-                live = LiveFlow(case, stored=stored)
-                self._is_current = live.is_prepared
-                return live
-        return LiveFlow(case, told)
-
-    def keep(self, live: "LiveFlow") -> None:
-        """Store the flow without a device, once."""
-        if not self._is_current and self.shelf is not None:
-            self._is_current = True
-            with suppress(OSError):
-                Store(self.shelf.folder).save(STORED, self.shelf.key, live.stored())
+def _before(treatment: Treatment, implant: Implant) -> tuple[Implant, ...]:
+    """Return the implants on which the deployment of an implant depends: it is inside of them, or they are."""
+    inside = [_implant(treatment, name) for name in implant.inside]
+    return tuple(found for one in inside for found in (*_before(treatment, one), one))
 
 
-class _Worker:
-    """The flow and what was last said of it."""
+def _opening_colour(opening: Opening) -> tuple[float, float, float]:
+    """Return the color of an opening."""
+    number = 0 if opening.is_inlet else int(opening.role.rpartition("_")[2])
+    return OPENING_COLOURS[number] if number < len(OPENING_COLOURS) else (0.45, 0.50, 0.54)
 
-    def __init__(self, pipe: Connection, anatomy: Anatomy, settings: FlowSettings, store: _Store) -> None:
-        from vstent.flow.problem import flow_case
 
-        self.pipe, self.anatomy, self.settings, self.store = pipe, anatomy, settings, store
-        self.serial, self.watched_s, self.drawn_s = 0, -WATCHED_S, 0.0
-        self.left_s, self.said = PREPARED_S, Said(fraction=1.0)
-        self.live = store.begin(flow_case(anatomy, (), settings), lambda done: pipe.send(Said(fraction=done)))
-        pipe.send(self.said)
+def _disc(number: int, opening: Opening) -> MeshLayer:
+    """Return a disc with the area of an opening, slightly outside it."""
+    angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    first = np.cross(opening.normal, np.eye(3)[np.argmin(np.abs(opening.normal))])
+    first /= np.linalg.norm(first)
+    second = np.cross(opening.normal, first)
+    ring = np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second)
+    center = opening.center_mm + 0.05 * opening.normal
+    points = np.concatenate([center[None], center + 0.5 * opening.diameter_mm * ring])
+    around = np.arange(40)
+    faces = np.stack([np.zeros(40, int), 1 + around, 1 + (around + 1) % 40], axis=1)
+    surface = Surface(points, faces)
+    return MeshLayer(f"opening {number}", "", _opening_colour(opening), surface)
 
-    def run(self) -> None:
-        """Step and report while somebody watches; else prepare the flow without a device, and rest."""
-        while True:
-            self._take()
-            began = time.perf_counter()
-            if time.monotonic() - self.watched_s < WATCHED_S:
-                steps = self.live.advance(SLICE_S)
-                self._say(steps / (time.perf_counter() - began))
-            elif self.left_s > 0 and not self.live.is_prepared:
-                self.live.prepare(SLICE_S)
-                self.left_s -= time.perf_counter() - began
-            elif not self._is_asked_again():
-                return
 
-    def _is_asked_again(self) -> bool:
-        """Store the flow without a device, and wait for a request; return whether one has come."""
-        self.store.keep(self.live)
-        self.pipe.send(replace(self.said, is_prepared=True))
-        is_asked = self.pipe.poll(IDLE_S)
-        self.drawn_s = time.monotonic()
-        return is_asked
+def _wires(name: str, stent: Stent, gap_mm: Floats, colour: Colour, coverage: Callable[[], Floats]) -> LineLayer:
+    """Return the wires of a device, colored by the values at the nearest nodes (rows, columns)."""
+    of_node = gap_mm
+    if colour == "coverage":
+        of_node = 100 * coverage()
+    elif colour == "diameter":
+        of_node = np.broadcast_to(stent.row_diameter_mm[:, None], gap_mm.shape)
+    some = stent.wire_points_mm[::NEIGHBOURS]
+    near = cKDTree(stent.nodes_mm.reshape(-1, 3)).query(some)[1]
+    values = np.repeat(of_node.ravel()[near], NEIGHBOURS)[: len(stent.wire_points_mm)]
+    return LineLayer(
+        "wires",
+        name,
+        STEEL_COLOUR,
+        stent.wire_points_mm,
+        stent.wire_starts,
+        stent.wire_diameter_um / 2000,
+        scale=colour,
+        values=values,
+    )
 
-    def _take(self) -> None:
-        """Take the newest devices."""
-        newest = None
-        while self.pipe.poll():
-            newest = self.pipe.recv() or newest
-            self.watched_s = time.monotonic()
-        if newest is not None:
-            from vstent.flow.media import media
 
-            self.serial, stents = newest
-            self.live.place(tuple(medium for stent in stents for medium in media(stent, self.settings.blood)))
+def _formula_coverage(stent: Stent) -> Floats:
+    """Return the metal coverage (rows, columns) by the formula, from the diameter of every row."""
+    of_row = [coverage_fraction(stent.design, stent.size, float(d)) for d in stent.row_diameter_mm]
+    return np.broadcast_to(np.array(of_row)[:, None], stent.nodes_mm.shape[:2])
 
-    def _say(self, steps_per_s: float) -> None:
-        """Send the present numbers, and from time to time streamlines after them."""
-        bare, now = self.live.bare, self.live.read()
-        if 100 * min(bare.error.values()) > SHOWN_POINTS:
-            self.said = Said(self.serial, 1.0)
-            self.pipe.send(self.said)
-            return
-        points = {key: self.live.change(key)[1] for key in _KEYS}
-        points = {key: value for key, value in points.items() if value < SHOWN_POINTS}
-        values = {
-            "bare_neck_inflow_mL_s": bare.neck_inflow_mL_s,
-            "bare_sac_velocity_m_s": bare.sac_velocity_m_s,
-            "now_neck_inflow_mL_s": now.neck_inflow_mL_s,
-            "now_sac_velocity_m_s": now.sac_velocity_m_s,
-            "grid_spacing_mm": self.live.cell_size_mm,
-            "steps_per_s": steps_per_s,
-        }
-        self.said = Said(self.serial, 1.0, values, points, now.is_settled, self.live.is_prepared)
-        self.pipe.send(self.said)
-        if time.monotonic() - self.drawn_s > (LINES_S if points else 3 * LINES_S):
-            from vstent.flow.streamlines import neck_seeds_mm
 
-            flow, self.drawn_s = self.live.field(), time.monotonic()
-            seeds_mm = neck_seeds_mm(flow, self.anatomy.aneurysms[0].neck, LINES)
-            self.pipe.send(replace(self.said, lines=stream_layer("", flow, seeds_mm)))
+def _center_mm(stent: Stent) -> float:
+    """Return the position of the middle row along the parent axis."""
+    return float(stent.row_abscissa_mm[(len(stent.row_abscissa_mm) - 1) // 2])
+
+
+def _place(found: Sketch, stent: Stent) -> dict[str, Any]:
+    """Return the position of a device, with bands of uncertainty around its ends."""
+    ends = (stent.proximal_abscissa_mm, stent.distal_abscissa_mm)
+    sketched = (found.stent.proximal_abscissa_mm, found.stent.distal_abscissa_mm)
+    bands = [
+        [end + edge - middle for edge in sorted(band)]
+        for end, middle, band in zip(ends, sketched, (found.proximal_band_mm, found.distal_band_mm), strict=True)
+    ]
+    lengths = sorted(b - a for a, b in zip(found.proximal_band_mm, found.distal_band_mm, strict=True))
+    shift = stent.deployed_length_mm - (sketched[1] - sketched[0])
+    return {
+        "device": stent.design.key,
+        "size": stent.size.label,
+        "center_mm": _center_mm(stent),
+        "ends_mm": ends,
+        "ends_band_mm": bands,
+        "profile": np.round(np.stack([stent.row_abscissa_mm, stent.row_diameter_mm], axis=1), 3).tolist(),
+        "length_mm": stent.deployed_length_mm,
+        "length_band_mm": [length + shift for length in lengths],
+    }
+
+
+def _section(surface: Surface, center: Floats, frame: Floats) -> list[float]:
+    """Return the section of a surface near the axis as segments x1, y1, x2, y2 in the plane."""
+    near = np.linalg.norm(surface.corners_mm[:, 0] - center, axis=1) < SECTION_REACH_MM
+    offset = surface.vertices_mm - center
+    segments = clipping.section(offset, surface.faces[near], offset @ frame[0])
+    return np.round(segments @ frame[1:].T, 3).ravel().tolist()
+
+
+def _row_at(stent: Stent, at_mm: float) -> int | None:
+    """Return the row of a device nearest to a plane across the parent axis; None where the plane misses it."""
+    is_there = stent.proximal_abscissa_mm <= at_mm <= stent.distal_abscissa_mm
+    return int(np.argmin(np.abs(stent.row_abscissa_mm - at_mm))) if is_there else None

@@ -1,17 +1,18 @@
-"""Slices of a scan and its surface at a threshold, for the first step of the page."""
+"""Slices of a scan, as stored or along the axes of the patient, and its surface at a threshold, for the page."""
 
+from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import Any, Final
 
 import numpy as np
 
 from vstent.anatomy.segment import propose
-from vstent.app.planes import Grid, is_oblique, oblique_deg, reformatted, upright
 from vstent.errors import InputError
 from vstent.geometry.image import Image
 from vstent.geometry.surface import Surface
 from vstent.kernels import topology, triangles
-from vstent.kernels.arrays import Floats
+from vstent.kernels.arrays import Floats, freeze
 from vstent.kernels.isosurface import isosurface
 from vstent.reporting.packing import Packer, message
 from vstent.reporting.scene import FRONTAL, MeshLayer, view_of
@@ -25,8 +26,32 @@ SPECK: Final = 0.01
 """Size of a piece, as a fraction of the triangles of the largest piece, below which it is not drawn."""
 SAMPLE: Final = 3e5
 """Number of voxels, about, from which the quantiles of the intensity are computed."""
+STRAIGHT_DEG: Final = 0.5
+"""Angle between the axes of a scan and those of the patient below which its slices count as anatomical."""
 _LEVELS: Final = 65_535
 """Largest quantized intensity; it fits in two bytes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """A grid of voxels along the axes of the patient, without intensities."""
+
+    shape: tuple[int, int, int]
+    """Number of voxels to the left, to the back and to the head."""
+    affine_mm: Floats
+    """(4, 4) transform from a voxel index to LPS mm."""
+
+    def __post_init__(self) -> None:
+        freeze(self, "affine_mm", np.float64, (4, 4))
+
+    @cached_property
+    def spacing_mm(self) -> Floats:
+        """(3,) distance between neighbouring voxels."""
+        return np.diag(self.affine_mm)[:3].copy()
+
+    def to_index(self, points_mm: Floats) -> Floats:
+        """Return the fractional voxel indices (n, 3) of positions (n, 3) in LPS mm."""
+        return (np.asarray(points_mm, dtype=np.float64) - self.affine_mm[:3, 3]) / self.spacing_mm
 
 
 class Scan:
@@ -68,24 +93,38 @@ class Scan:
         return propose(self.part)[0].threshold
 
     @cached_property
+    def oblique_deg(self) -> Floats:
+        """Angles (3,) between the slices across each voxel axis and the nearest anatomical plane."""
+        along = np.abs(self.image.affine_mm[:3, :3]) / self.image.spacing_mm
+        return np.degrees(np.arccos(np.clip(along.max(axis=0), -1.0, 1.0)))
+
+    @cached_property
     def upright(self) -> Grid | None:
-        """Grid along the axes of the patient; None where the file's slices are anatomical or have no orientation."""
-        return upright(self.image) if is_oblique(self.image) else None
+        """Grid along the axes of the patient that holds the scan, with the spacing of the nearest axes.
+
+        None where the file's slices are anatomical or have no orientation.
+        """
+        image = self.image
+        if not image.is_oriented or self.oblique_deg.max() <= STRAIGHT_DEG:
+            return None
+        corners_mm = image.to_mm(np.array(list(product(*((0.0, n - 1.0) for n in image.voxels.shape)))))
+        nearest = np.abs(image.affine_mm[:3, :3] / image.spacing_mm).argmax(axis=1)
+        spacing_mm, low_mm = image.spacing_mm[nearest], corners_mm.min(axis=0)
+        counts = np.ceil((corners_mm.max(axis=0) - low_mm) / spacing_mm - 1e-6).astype(int) + 1
+        affine_mm = np.diag([*spacing_mm, 1.0])
+        affine_mm[:3, 3] = low_mm
+        i, j, k = (int(count) for count in counts)
+        return Grid((i, j, k), affine_mm)
 
     def grid(self, *, is_upright: bool) -> Image | Grid:
-        """Return the grid of the slices: that of the file, or the one along the axes of the patient.
-
-        Parameters
-        ----------
-        is_upright : whether the slices are anatomical planes.
-        """
+        """Return the grid of the slices: that of the file, or the one along the axes of the patient."""
         return self.upright if is_upright and self.upright is not None else self.image
 
     def told(self) -> dict[str, Any]:
         """Return shape, spacing, affine, range and quantiles of the intensity; nothing that takes long."""
         turned = self.upright
         return {
-            "oblique_deg": oblique_deg(self.image).tolist(),
+            "oblique_deg": self.oblique_deg.tolist(),
             "upright": turned
             and {
                 "shape": turned.shape,
@@ -108,13 +147,8 @@ class Scan:
         """Return the quantized values of one slice, or the maximum of a slab, as a message for the page.
 
         Columns run fastest. All slices share the quantization that `told` states: intensity = low + step * integer.
-
-        Parameters
-        ----------
-        axis : voxel axis across the slice: 0, 1 or 2.
-        index : voxel index along that axis.
-        slab : number of slices on each side that the maximum includes.
-        is_upright : whether the slice is an anatomical plane of an oblique scan, interpolated between its voxels.
+        The slice lies across a voxel axis; a slab includes so many slices on each side of it. An upright slice is an
+        anatomical plane of an oblique scan, interpolated between its voxels.
 
         Raises
         ------
@@ -129,7 +163,7 @@ class Scan:
         if grid is None:
             plane = np.moveaxis(self.image.voxels, axis, 0)[first:last].max(axis=0).T
         else:
-            plane = reformatted(self.image, grid, axis, first, last).T
+            plane = _reformatted(self.image, grid, axis, first, last).T
         low, step = self._ends[0], self._step
         levels = np.rint((plane.astype(np.float64) - low) / step)
         is_narrow = self._ends[1] - low <= 255 * step
@@ -145,15 +179,27 @@ class Scan:
         index, faces = isosurface(field, threshold)
         layers, views = [], []
         if len(faces):
-            index, faces = _without_specks(index, faces)
+            label = topology.face_components(faces)
+            count = np.bincount(label)
+            index, faces = triangles.compact(index, faces[count[label] >= SPECK * count.max()])
             surface = thin_surface(Surface(self.part.to_mm(stride * index), faces), LIVE_FACES)[0]
-            layers = [MeshLayer("live", "", (0.80, 0.62, 0.55), "", np.zeros(0), surface)]
+            layers = [MeshLayer("live", "", (0.80, 0.62, 0.55), surface)]
             views = [view_of("whole", FRONTAL, surface.vertices_mm)]
         return message(layers, views=views, threshold=threshold)
 
 
-def _without_specks(index: Floats, faces: Any) -> tuple[Floats, Any]:
-    """Return vertices and faces without small pieces."""
-    label = topology.face_components(faces)
-    count = np.bincount(label)
-    return triangles.compact(index, faces[count[label] >= SPECK * count.max()])
+def _reformatted(image: Image, grid: Grid, axis: int, first: int, last: int) -> Any:
+    """Return the largest interpolated intensities of slices of a grid, columns first; the lowest outside the scan."""
+    from scipy.ndimage import affine_transform
+
+    shape = list(grid.shape)
+    shape[axis] = last - first
+    inverse = np.linalg.inv(image.affine_mm)
+    matrix = inverse[:3, :3] @ grid.affine_mm[:3, :3]
+    origin = np.zeros(3)
+    origin[axis] = first
+    start = inverse[:3, :3] @ grid.affine_mm[:3, 3] + inverse[:3, 3] + matrix @ origin
+    voxels = image.voxels.view(np.uint8) if image.voxels.dtype == bool else image.voxels
+    found = np.zeros(shape, dtype=np.float32)
+    affine_transform(voxels, matrix, start, output=found, order=1, mode="constant", cval=float(voxels.min()))
+    return found.max(axis=axis)

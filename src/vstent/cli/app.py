@@ -5,13 +5,9 @@ import importlib.util
 import socket
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from vstent.cli import options
-
-if TYPE_CHECKING:
-    from vstent.app.desk import Desk
-
 
 LAST_PORT: Final = 65535
 """Largest port number."""
@@ -53,14 +49,18 @@ def _app(arguments: argparse.Namespace) -> int:
         raise InputError("The page needs two more packages: run `pip install 'vstent[app]'`, then try again.")
     import uvicorn
 
+    from vstent.app.cases import Cases
     from vstent.app.server import create, new_token
+    from vstent.app.workspace import Workspace
 
-    desk = open_desk(arguments.input, arguments.cases)
+    workspace = Workspace(Cases(arguments.cases.resolve()))
+    if arguments.input is not None:
+        workspace.open(arguments.input.resolve())
     listener = _listen(arguments.host, arguments.port)
     port = listener.getsockname()[1]
     token = new_token()
     hosts = tuple(dict.fromkeys(f"{name}:{port}" for name in (arguments.host, "127.0.0.1", "localhost")))
-    guard = create(desk, token=token, hosts=hosts)
+    guard = create(workspace, token=token, hosts=hosts)
     url = f"http://{arguments.host}:{port}/?token={token}"
     config = uvicorn.Config(guard, log_level="warning", timeout_graceful_shutdown=1, access_log=False)
     print(f"vstent is at  {url}\nStop it with Ctrl-C. Research use only.", flush=True)
@@ -77,15 +77,3 @@ def _listen(host: str, port: int) -> socket.socket:
     listener.bind((host, port))
     listener.listen(128)
     return listener
-
-
-def open_desk(given: Path | None, workspace: Path) -> "Desk":
-    """Return a desk with its cases."""
-    from vstent.app.cases import Store
-    from vstent.app.desk import Desk
-
-    store = Store(workspace.resolve())
-    desk = Desk(store)
-    if given is not None:
-        desk.open(given.resolve())
-    return desk

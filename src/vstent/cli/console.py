@@ -146,17 +146,30 @@ def _bare(metrics: Mapping[str, Any]) -> dict[str, Any]:
 
 def _banded(key: str, implant: Mapping[str, Any]) -> str:
     """Return a measure of an implant with its band."""
-    from vstent.reporting.bands import ends
+    from vstent.reporting.uncertainty import ends
 
     return f"{_cell(key, implant.get(key))} {_spaced(ends(implant, key))}".rstrip()
 
 
 def device_sentences(metrics: Mapping[str, Any]) -> list[str]:
-    """Return how sure the device of each implant is, one text each."""
-    from vstent.reporting.bands import how_sure
+    """Return how sure each device is, one text each, with the ranges of all its implants."""
+    from vstent.reporting.uncertainty import how_sure
 
-    implants = [one for found in _treatments(metrics).values() for one in found["implants"].values()]
-    return list(dict.fromkeys(_spaced(how_sure(one)) for one in implants if one.get("bands")))
+    by_device: dict[str, dict[str, Any]] = {}
+    for name, treatment in _treatments(metrics).items():
+        for key, implant in treatment["implants"].items():
+            if implant.get("bands"):
+                title = name if len(treatment["implants"]) == 1 else f"{key} of {name}"
+                by_device.setdefault(implant["bands"]["device"], {})[title] = implant
+    return [
+        _spaced(
+            " ".join(
+                how_sure(implant, title if len(implants) > 1 else "", is_told=number > 0)
+                for number, (title, implant) in enumerate(implants.items())
+            )
+        )
+        for implants in by_device.values()
+    ]
 
 
 def _add_grades(table: Table, metrics: Mapping[str, Any]) -> None:
@@ -438,7 +451,7 @@ def _plain_number(value: float) -> str:
 
 def _number_title(name: str) -> str:
     """Return the display name of a fitted number."""
-    from vstent.reporting.bands import number_name
+    from vstent.reporting.uncertainty import number_name
 
     base, _, label = name.partition(" ")
     if label:

@@ -80,54 +80,43 @@ class Outlier(NamedTuple):
 
 
 def cohort_report(name: str, rows: Sequence[Row], pictures: Mapping[tuple[str, str], bytes] = EMPTY) -> str:
-    """Return the report of a cohort as the text of one HTML file.
+    """Return the report of a cohort as the text of one HTML file that loads nothing from a network.
 
-    The file is self-contained: it loads nothing from a network.
-
-    Parameters
-    ----------
-    name : name of the cohort.
-    rows : one row per case and treatment, with ``case``, ``treatment``, ``outcome``, ``stage``, ``sentence``, metrics.
-    pictures : pictures of the deployed treatments as WebP, by case and treatment.
-
-    Returns HTML.
+    A row per case and treatment has ``case``, ``treatment``, ``outcome``, ``stage``, ``sentence`` and metrics; pictures
+    of deployed treatments are WebP, by case and treatment.
     """
     from jinja2 import Environment, PackageLoader
 
     done = [row for row in rows if row["outcome"] == "done"]
     treatments = list(dict.fromkeys(row["treatment"] for row in rows))
+    counts, patients = [], []
+    for treatment in treatments:
+        of_treatment = [row for row in rows if row["treatment"] == treatment]
+        outcomes = [row["outcome"] for row in of_treatment]
+        counts.append((treatment, *(outcomes.count(end) for end in ("done", "failed", "lost"))))
+        shown = [
+            (str(row["case"]), _caption(row), base64.b64encode(pictures[row["case"], treatment]).decode("ascii"))
+            for row in of_treatment
+            if (row["case"], treatment) in pictures
+        ]
+        if shown:
+            patients.append((treatment, shown))
+    distributions = [
+        (_name(key), [distribution(done, one, key) for one in treatments if _values(done, one, key)])
+        for key in HEADLINES
+    ]
     environment = Environment(loader=PackageLoader("vstent.reporting", "assets"), autoescape=True)
     return environment.get_template("cohort.html.j2").render(
         name=name,
         style=Markup(asset("report.css")),
-        counts=[(treatment, *_counts(rows, treatment)) for treatment in treatments],
-        patients=[(treatment, shown) for treatment in treatments if (shown := _patients(rows, treatment, pictures))],
+        counts=counts,
+        patients=patients,
         n_cases=len({row["case"] for row in rows}),
-        distributions=[
-            (
-                _name(key),
-                [distribution(done, treatment, key) for treatment in treatments if _values(done, treatment, key)],
-            )
-            for key in HEADLINES
-            if any(_is_number(row.get(key)) for row in done)
-        ],
-        outliers=[
-            outlier for treatment in treatments for key in HEADLINES for outlier in outliers(done, treatment, key)
-        ],
+        distributions=[(title, found) for title, found in distributions if found],
+        outliers=[one for treatment in treatments for key in HEADLINES for one in outliers(done, treatment, key)],
         failures=[row for row in rows if row["outcome"] != "done"],
         limit=OUTLYING,
     )
-
-
-def _patients(
-    rows: Sequence[Row], treatment: str, pictures: Mapping[tuple[str, str], bytes]
-) -> list[tuple[str, str, str]]:
-    """Return case, caption and base64-encoded WebP of every picture of a treatment, in the order of the rows."""
-    found = [row for row in rows if row["treatment"] == treatment and (row["case"], treatment) in pictures]
-    return [
-        (str(row["case"]), _caption(row), base64.b64encode(pictures[row["case"], treatment]).decode("ascii"))
-        for row in found
-    ]
 
 
 def _caption(row: Row) -> str:
@@ -136,23 +125,11 @@ def _caption(row: Row) -> str:
     return ", ".join(f"{_name(key).lower()} {format_value(_leaf(key), float(value))}" for key, value in shown)
 
 
-def _counts(rows: Sequence[Row], treatment: str) -> tuple[int, int, int]:
-    """Return the numbers of finished, failed and lost cases of a treatment."""
-    outcomes = [row["outcome"] for row in rows if row["treatment"] == treatment]
-    return outcomes.count("done"), outcomes.count("failed"), outcomes.count("lost")
-
-
 def modified_z_scores(values: Sequence[float]) -> list[float]:
     """Return the modified z-score of every value.
 
     It is the distance from the median divided by the median absolute deviation, scaled to the standard deviation of
-    a normal distribution.
-
-    Shapes: `values` (n,).
-
-    References
-    ----------
-    Iglewicz and Hoaglin 1993, How to Detect and Handle Outliers.
+    a normal distribution (Iglewicz and Hoaglin 1993).
     """
     if not len(values):
         return []
@@ -176,14 +153,7 @@ def outliers(rows: Sequence[Row], treatment: str, key: str) -> list[Outlier]:
 
 
 def distribution(rows: Sequence[Row], treatment: str, key: str) -> Distribution:
-    """Return the distribution of one metric of one treatment.
-
-    Parameters
-    ----------
-    rows : rows of the cohort table, of all treatments; they set the range of the strip plot.
-    treatment : name of the treatment.
-    key : column of the metric.
-    """
+    """Return the distribution of one metric of one treatment; the rows of all set the range of the strip plot."""
     found = _values(rows, treatment, key)
     values = [value for _, value in found]
     quantiles = np.quantile(values, (0.0, 0.25, 0.5, 0.75, 1.0))

@@ -1,9 +1,7 @@
 """Draw the pictures of a case on threads, while its measures are computed."""
 
-from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
-from types import TracebackType
-from typing import TYPE_CHECKING, Self, TypeVar
+from typing import TYPE_CHECKING, Self
 
 from numba import config
 
@@ -13,15 +11,6 @@ from vstent.reporting.scene import Scene, scene_of
 
 if TYPE_CHECKING:
     from vstent.study.pipeline import Computed
-
-Item = TypeVar("Item")
-Found = TypeVar("Found")
-
-
-def in_threads(call: Callable[[Item], Found], items: Iterable[Item]) -> list[Found]:
-    """Return the results of a call for every item, computed on as many threads as the kernels use."""
-    with ThreadPoolExecutor(config.NUMBA_NUM_THREADS) as pool:
-        return list(pool.map(call, items))
 
 
 class Drawing:
@@ -41,19 +30,12 @@ class Drawing:
         """Return the drawing."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Drop the pictures that are not begun."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def begin(self, case: "Computed") -> Scene:
-        """Begin to draw all pictures of a case, unless this has been done; return its scene.
-
-        Parameters
-        ----------
-        case : what a study has computed.
-        """
+        """Begin to draw all pictures of what a study has computed, unless this has been done; return its scene."""
         if self._scene is None:
             self._scene = scene_of(case.anatomy, case.implants, case.fields)
             before, *after = plates(self._scene)

@@ -3,17 +3,20 @@
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vstent.devices.stent import Deployment
-from vstent.devices.treatment import BARE
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels import raster
 from vstent.kernels.arrays import Floats
-from vstent.reporting.lettering import blank, color_bar, length_bar, points_px, put, put_title
+from vstent.reporting.lettering import DPI, blank, color_bar, length_bar, points_px, put, put_title
 from vstent.reporting.scene import LineLayer, MeshLayer, Scene, View, scene_of, view_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 BACKGROUND = (0.965, 0.973, 0.978)
 """Background color: red, green and blue, 0 to 1."""
@@ -51,21 +54,20 @@ class Picture:
     @property
     def png(self) -> bytes:
         """The picture as PNG, without metadata, so that equal pictures give equal bytes."""
-        return _encoded(self.image, "PNG")
+        return self._encoded("PNG")
 
     @property
     def webp(self) -> bytes:
         """The picture as WebP: about a fifth of the bytes of the PNG without a visible difference."""
-        return _encoded(self.image, "WEBP", quality=WEBP_QUALITY, method=WEBP_METHOD)
+        return self._encoded("WEBP", quality=WEBP_QUALITY, method=WEBP_METHOD)
 
+    def _encoded(self, kind: str, **options: int) -> bytes:
+        """Return the picture as a file of this kind."""
+        from PIL import Image
 
-def _encoded(image: NDArray[np.uint8], kind: str, **options: int) -> bytes:
-    """Return an image as a file of this kind."""
-    from PIL import Image
-
-    stream = io.BytesIO()
-    Image.fromarray(image).save(stream, kind, **options)
-    return stream.getvalue()
+        stream = io.BytesIO()
+        Image.fromarray(self.image).save(stream, kind, **options)
+        return stream.getvalue()
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,27 +110,78 @@ def plates(scene: Scene) -> list[Plate]:
     The anatomy is always shown; contour, coverage and wires where there is a device; streamlines and wall shear stress
     where a flow was computed.
     """
-    found = [_anatomy(scene)]
-    if len(scene.panes) > 1:
-        found += [_contour(scene), _coverage(scene), _wires(scene)]
-    drawn = {layer.id for layer in scene.layers}
-    if "streamlines" in drawn:
-        found.append(_streamlines(scene))
-    if "shear" in drawn:
-        found.append(_shear(scene))
-    if "sac_shear" in drawn:
-        found.append(_sac_shear(scene))
-    return found
+    bare, *devices = scene.panes
+
+    def by_value(
+        name: str, ids: tuple[str, ...], title: str, caption: str, panes: Sequence[tuple[str, str]] = scene.panes
+    ) -> Plate:
+        """Return a picture with one panel per treatment, in profile, colored by one scale."""
+        shots = [Shot(words, scene.pick(ids, pane), scene.view("profile")) for pane, words in panes]
+        return Plate(name, title, caption, scene, shots, "speed" if name == "streamlines" else name)
+
+    sides = {"profile": "In profile", "frontal": "Frontal", "lateral": "From the left"}
+    layers = ("lumen", "continued", "landing", "sac", "neck")
+    shots = [Shot(title, scene.pick(layers, bare[0]), scene.view(view)) for view, title in sides.items()]
+    caption = "The patient's lumen (glass), the restored parent artery (sand), the sac (red) and the neck (red line)."
+    drawn = [Plate("anatomy", "The artery and its sac", caption, scene, shots)]
+    if devices:
+        coverage = (
+            "Metal coverage: fraction of the contour covered by metal, measured on the wires and averaged over a "
+            "few pores; higher on the inside of a bend, lower on its outside."
+        )
+        wires = (
+            "The wires and the neck (red line), seen from the sac with its wall removed; wires on the far side are "
+            "paler."
+        )
+        shots = [
+            Shot(f"{title}: {shot.title.lower()}", shot.layers, shot.view)
+            for pane, title in devices
+            for shot in wire_shots(scene, pane)
+        ]
+        ids = ("lumen", "continued", "coverage", "neck")
+        drawn.append(_contours(scene))
+        drawn.append(by_value("coverage", ids, "Metal coverage of the wall", coverage, devices))
+        drawn.append(Plate("wires", "Wires across the neck", wires, scene, shots))
+    present = {layer.id for layer in scene.layers}
+    return drawn + [by_value(*row) for row in _OF_FLOW if row[0] in present]
+
+
+_OF_FLOW = (
+    (
+        "streamlines",
+        ("lumen", "streamlines", "neck"),
+        "Blood flow before and after",
+        f"Streamlines through artery and sac, colored by speed on one scale. {ABOVE}",
+    ),
+    (
+        "shear",
+        ("shear", "neck"),
+        "Wall shear stress before and after",
+        f"Wall shear stress on the lumen, on one scale. {ABOVE}",
+    ),
+    (
+        "sac_shear",
+        ("sac_shear", "neck"),
+        "Wall shear stress of the sac",
+        f"Wall shear stress of the sac alone, on the scale of the sac without a device. {ABOVE}",
+    ),
+)
+"""Layer that a picture of the flow shows, all its layers, its title and its caption."""
+
+
+def wire_shots(scene: Scene, pane: str, *more: str) -> list[Shot]:
+    """Return the wires of a treatment in profile, with `more` layers, and from the sac where there is one."""
+    looks = {
+        "profile": ("In profile", ("lumen", "continued", "wires", "neck", *more)),
+        "neck": ("Seen from the sac", ("wires", "neck")),
+    }
+    return [
+        Shot(looks[view.id][0], scene.pick(looks[view.id][1], pane), view) for view in scene.views if view.id in looks
+    ]
 
 
 def patient_picture(anatomy: Anatomy, deployments: Sequence[Deployment]) -> Picture:
-    """Return a small picture of implants in the artery of a patient, in profile, for a grid of patients.
-
-    Parameters
-    ----------
-    anatomy : vessel, parent artery and sacs.
-    deployments : the deployed implants.
-    """
+    """Return a small picture of implants in the artery of a patient, in profile, for a grid of patients."""
     scene = scene_of(anatomy, {"one": {str(k): one for k, one in enumerate(deployments)}}, {})
     view, picture = scene.views[0], blank(*PATIENT_PX)
     put(picture, draw(scene.pick(("lumen", "continued", "wires", "neck"), "one"), scene, view, PATIENT_PX), (0, 0))
@@ -136,74 +189,43 @@ def patient_picture(anatomy: Anatomy, deployments: Sequence[Deployment]) -> Pict
     return Picture("patient", "", "", np.asarray(picture))
 
 
-def overview(scene: Scene) -> bytes:
-    """Return one wide PNG that sums up a case: wires across the neck, and streamlines where a flow was computed."""
-    layers = ("lumen", "continued", "wires", "neck", "streamlines")
-    shots = [Shot(title, scene.pick(layers, pane), scene.view("profile")) for pane, title in scene.panes]
-    scales = {scale.id for scale in scene.scales}
-    return Plate("overview", "", "", scene, shots, "speed" if "speed" in scales else "").drawn().png
-
-
 def draw(layers: tuple[MeshLayer | LineLayer, ...], scene: Scene, view: View, size_px: tuple[int, int]) -> Floats:
-    """Render layers seen from a view.
+    """Render layers seen from a view as an image (height, width, 3) of a size (width, height), 0 to 1.
 
     Opaque triangles and lines hide what is farther away. Translucent layers are blended over them and are denser at
-    grazing angles, so that a tube shows both its outline and its contents.
-
-    Parameters
-    ----------
-    layers : meshes and lines to draw.
-    scene : scene that holds their color scales.
-    view : direction, center and radius of the view.
-    size_px : width and height of the image in pixels.
-
-    Returns (height, width, 3) red, green and blue, 0 to 1.
+    grazing angles, so that a tube shows both its outline and its contents. `scene` holds the color scales.
     """
     width, height = (n * _SUPERSAMPLING for n in size_px)
-    pixel = span_mm(view, size_px) / width
+    pixel_mm = span_mm(view, size_px) / width
+    light = _LIGHT / np.linalg.norm(_LIGHT)
     image = np.full((height, width, 3), BACKGROUND, np.float32)
     depth = np.full((height, width), np.inf, np.float32)
     sums, clear = np.zeros((height, width, 4), np.float32), np.ones((height, width), np.float32)
-    for layer in sorted(layers, key=_is_translucent):
-        points = layer.points_mm if isinstance(layer, LineLayer) else layer.surface.vertices_mm
-        screen = _to_screen(points, view, pixel, (width, height))
+    for layer in sorted(layers, key=lambda layer: isinstance(layer, MeshLayer) and layer.opacity < 1.0):
+        seen = (layer.vertices_mm - view.center_mm) @ view.axes.T
+        columns, rows = 0.5 * width + seen[:, 0] / pixel_mm, 0.5 * height - seen[:, 1] / pixel_mm
+        screen = np.stack([columns, rows, -seen[:, 2]], axis=1)
         colours = _colours(layer, scene, screen[:, 2])
         if isinstance(layer, LineLayer):
-            radius = np.maximum(layer.radius_mm / pixel, 0.55 * _SUPERSAMPLING)
-            raster.paint_wires(screen, layer.starts, radius, pixel, colours, depth, image)
+            radius = np.maximum(layer.radius_mm / pixel_mm, 0.55 * _SUPERSAMPLING)
+            raster.paint_wires(screen, layer.starts, radius, pixel_mm, colours, depth, image)
             continue
         normals = layer.surface.vertex_normals @ view.axes.T
-        shaded = colours * _brightness(normals, 0.72 if layer.scale else 0.50)[:, None]
-        if _is_translucent(layer):
-            alphas = _alphas(layer.opacity, normals)
+        ambient = 0.72 if layer.scale else 0.50
+        facing = normals * np.where(normals[:, 2:] < 0, -1.0, 1.0)  # lit on both sides
+        shaded = colours * (ambient + (1.0 - ambient) * np.maximum(facing @ light, 0.0))[:, None]
+        if layer.opacity < 1.0:
+            grazing = (1.0 - np.abs(normals[:, 2])) ** 3
+            alphas = layer.opacity + (1.0 - layer.opacity) * 0.75 * grazing
             raster.veil_triangles(screen, shaded, alphas, layer.surface.faces, depth, sums, clear)
         else:
             raster.paint_triangles(screen, shaded, layer.surface.faces, depth, image)
     return np.clip(raster.resolve(image, sums, clear, _SUPERSAMPLING), 0.0, 1.0)
 
 
-def _is_translucent(layer: MeshLayer | LineLayer) -> bool:
-    """Return whether a layer is a mesh with an opacity below 1."""
-    return isinstance(layer, MeshLayer) and layer.opacity < 1.0
-
-
 def span_mm(view: View, size_px: tuple[int, int]) -> float:
-    """Return the length in mm that the width of a picture shows.
-
-    The sphere of the view fits into the picture with a small margin.
-
-    Parameters
-    ----------
-    view : the view.
-    size_px : width and height of the picture in pixels.
-    """
+    """Return the length in mm that the width of a picture (width, height) shows: the view's sphere and a margin."""
     return 2.15 * view.radius_mm * max(1.0, size_px[0] / size_px[1])
-
-
-def _to_screen(points_mm: Floats, view: View, pixel: float, size: tuple[int, int]) -> Floats:
-    """Return points (n, 3) as column and row in pixels and depth in mm; `pixel` is the size of a pixel in mm."""
-    seen = (points_mm - view.center_mm) @ view.axes.T
-    return np.stack([0.5 * size[0] + seen[:, 0] / pixel, 0.5 * size[1] - seen[:, 1] / pixel, -seen[:, 2]], axis=1)
 
 
 def _colours(layer: MeshLayer | LineLayer, scene: Scene, depth_mm: Floats) -> Floats:
@@ -217,29 +239,8 @@ def _colours(layer: MeshLayer | LineLayer, scene: Scene, depth_mm: Floats) -> Fl
     return colours * (1 - pale) + np.array(BACKGROUND) * pale
 
 
-def _brightness(normals: Floats, ambient: float) -> Floats:
-    """Return the brightness (n,) of a surface lit on both sides, from unit normals (n, 3) in view axes."""
-    facing = normals * np.where(normals[:, 2:] < 0, -1.0, 1.0)
-    return ambient + (1.0 - ambient) * np.maximum(facing @ (_LIGHT / np.linalg.norm(_LIGHT)), 0.0)
-
-
-def _alphas(opacity: float, normals: Floats) -> Floats:
-    """Return the opacity (n,) of vertices: higher where the surface is seen at a grazing angle."""
-    return opacity + (1.0 - opacity) * 0.75 * (1.0 - np.abs(normals[:, 2])) ** 3
-
-
-def _anatomy(scene: Scene) -> Plate:
-    """Return the picture of vessel, parent artery, sac and neck from three sides."""
-    ids = ("lumen", "continued", "landing", "sac", "neck")
-    titles = {"profile": "In profile", "frontal": "Frontal", "lateral": "From the left"}
-    shots = [Shot(title, scene.pick(ids, BARE), scene.view(view)) for view, title in titles.items()]
-    caption = "The patient's lumen (glass), the restored parent artery (sand), the sac (red) and the neck (red line)."
-    return Plate("anatomy", "The artery and its sac", caption, scene, shots)
-
-
-def _contour(scene: Scene) -> Plate:
+def _contours(scene: Scene) -> Plate:
     """Return the picture of the deployed contours, colored by their gap to the wall."""
-    ids = ("lumen", "continued", "contour", "neck")
     shots = []
     for pane, title in scene.panes[1:]:
         contour = next(layer for layer in scene.pick(("contour",), pane) if isinstance(layer, MeshLayer))
@@ -247,7 +248,7 @@ def _contour(scene: Scene) -> Plate:
         profile, is_seen = scene.view("profile"), largest_mm >= SEEN_GAP_MM
         words = f"gap of {largest_mm:.2f} mm" if is_seen else f"gaps below {SEEN_GAP_MM:g} mm"
         view = gap_view(contour, profile) if is_seen else profile
-        shots.append(Shot(f"{title}: {words}", scene.pick(ids, pane), view))
+        shots.append(Shot(f"{title}: {words}", scene.pick(("lumen", "continued", "contour", "neck"), pane), view))
     caption = (
         "The deployed contour in the lumen, colored by its gap to the wall of the parent artery and seen from the side "
         "where the gap is largest."
@@ -268,66 +269,20 @@ def gap_view(contour: MeshLayer, profile: View) -> View:
     return view_of("gap", np.stack([np.cross(up, toward), up, toward]), contour.surface.vertices_mm)
 
 
-def _coverage(scene: Scene) -> Plate:
-    """Return the picture of the metal coverage of each device."""
-    ids = ("lumen", "continued", "coverage", "neck")
-    shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes[1:]]
-    caption = (
-        "Metal coverage: fraction of the contour covered by metal, measured on the wires and averaged over a "
-        "few pores; higher on the inside of a bend, lower on its outside."
-    )
-    return Plate("coverage", "Metal coverage of the wall", caption, scene, shots, "coverage")
+def image_of(figure: "Figure") -> NDArray[np.uint8]:
+    """Return a figure of matplotlib as an image (height, width, 3), at the resolution of all pictures."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-
-def _wires(scene: Scene) -> Plate:
-    """Return the picture of the wires in profile and seen from the sac."""
-    looks = {
-        "profile": ("in profile", ("lumen", "continued", "wires", "neck")),
-        "neck": ("seen from the sac", ("wires", "neck")),
-    }
-    shots = [
-        Shot(f"{title}: {looks[view.id][0]}", scene.pick(looks[view.id][1], pane), view)
-        for pane, title in scene.panes[1:]
-        for view in scene.views
-        if view.id in looks
-    ]
-    caption = (
-        "The wires and the neck (red line), seen from the sac with its wall removed; wires on the far side are paler."
-    )
-    return Plate("wires", "Wires across the neck", caption, scene, shots)
-
-
-def _streamlines(scene: Scene) -> Plate:
-    """Return the picture of the streamlines without and with each device."""
-    ids = ("lumen", "streamlines", "neck")
-    shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes]
-    caption = f"Streamlines through artery and sac, colored by speed on one scale. {ABOVE}"
-    return Plate("streamlines", "Blood flow before and after", caption, scene, shots, "speed")
-
-
-def _shear(scene: Scene) -> Plate:
-    """Return the picture of the wall shear stress without and with each device."""
-    shots = [Shot(title, scene.pick(("shear", "neck"), pane), scene.view("profile")) for pane, title in scene.panes]
-    caption = f"Wall shear stress on the lumen, on one scale. {ABOVE}"
-    return Plate("shear", "Wall shear stress before and after", caption, scene, shots, "shear")
-
-
-def _sac_shear(scene: Scene) -> Plate:
-    """Return the picture of the sac's wall shear stress on its own scale, without and with each device."""
-    ids = ("sac_shear", "neck")
-    shots = [Shot(title, scene.pick(ids, pane), scene.view("profile")) for pane, title in scene.panes]
-    caption = f"Wall shear stress of the sac alone, on the scale of the sac without a device. {ABOVE}"
-    return Plate("sac_shear", "Wall shear stress of the sac", caption, scene, shots, "sac_shear")
+    figure.set_dpi(DPI)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 def sheet(scene: Scene, shots: list[Shot], scale: str) -> NDArray[np.uint8]:
-    """Return an image (height, width, 3) of panels side by side, each with a length bar, over one common color bar.
+    """Return an image (height, width, 3) of panels, each with a length bar, over one common color bar.
 
-    Parameters
-    ----------
-    scene : scene that holds the color scales.
-    shots : panels; four are laid out in two rows, others in rows of at most three.
-    scale : name of the scale of the color bar; empty: no color bar.
+    Four panels are laid out in two rows, others in rows of at most three. Without `scale` there is no color bar.
     """
     columns = 2 if len(shots) == 4 else min(len(shots), 3)
     rows = -(-len(shots) // columns)

@@ -18,9 +18,8 @@ from vstent.io.films import write_animation, write_frames
 from vstent.io.writers import write_json
 from vstent.io.xa_writer import BITS, XaHeader, write_xa
 from vstent.kernels.arrays import Floats
-from vstent.reporting.figures import Picture
+from vstent.reporting.figures import Picture, image_of
 from vstent.reporting.lettering import blank, font, put_title
-from vstent.reporting.plots import image_of
 from vstent.study.contrast import FOLDER
 
 ANIMATION: Final = "angiogram.webp"
@@ -90,12 +89,9 @@ def bytes_of(levels: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def beside(shown: Sequence[Shown], window: float) -> list[NDArray[np.uint8]]:
-    """Return the frames of films side by side, each with its title, direction and time above it.
+    """Return the frames of films of equal times side by side, each with title, direction and time above it.
 
-    Parameters
-    ----------
-    shown : films of equal times.
-    window : absorption that is shown black.
+    `window` is the absorption that is shown black.
     """
     from PIL import Image, ImageDraw
 
@@ -133,13 +129,7 @@ def key_times_s(before: Film) -> tuple[tuple[str, float], ...]:
 
 
 def key_frames(shown: Sequence[Shown], window: float) -> Picture:
-    """Return the picture of the key frames: one row per film, one column per moment.
-
-    Parameters
-    ----------
-    shown : the film without a device first.
-    window : absorption that is shown black.
-    """
+    """Return the picture of the key frames: one row per film, the one without a device first; a column per moment."""
     from PIL import Image
 
     moments = key_times_s(shown[0].film)
@@ -210,7 +200,8 @@ def write_films(
     for number, (name, one) in enumerate(shown.items(), start=1):
         levels = list(one.levels(window))
         write_frames(out / name, [bytes_of(frame) for frame in levels])
-        write_xa(out / f"{name}.dcm", _stored(levels), header_of(one, window, number, dict(study or {})))
+        stored = np.stack([np.rint(((1 << BITS) - 1) * frame).astype(np.uint16) for frame in levels])
+        write_xa(out / f"{name}.dcm", stored, header_of(one, window, number, dict(study or {})))
         written += [name, f"{name}.dcm"]
     write_animation(out / ANIMATION, beside(films, window), 1.0 / films[0].film.frame_rate_Hz)
     pictures = [key_frames(films, window), *([density_picture(densities)] if densities else [])]
@@ -232,29 +223,21 @@ class KeptFilms:
     """All films side by side as an animated WebP; empty where it is too large for the report."""
 
 
-def _image(file: Path) -> NDArray[np.uint8]:
-    """Return a stored picture (height, width, 3)."""
-    from PIL import Image
-
-    with Image.open(file) as picture:
-        return np.asarray(picture.convert("RGB"))
-
-
 def kept_films(case: Path) -> KeptFilms | None:
     """Return the films in the subfolder ``angiogram`` of a case folder; None where there are none."""
+    from PIL import Image
+
     folder = case / FOLDER
     try:
         told = json.loads((folder / INDEX).read_text(encoding="utf-8"))["pictures"]
-        pictures = tuple(Picture(**one, image=_image(folder / f"{one['id']}.png")) for one in told)
+        pictures = []
+        for one in told:
+            with Image.open(folder / f"{one['id']}.png") as picture:
+                pictures.append(Picture(**one, image=np.asarray(picture.convert("RGB"))))
         film = (folder / ANIMATION).read_bytes()
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    return KeptFilms(pictures, film if len(film) <= SMALL_BYTES else b"")
-
-
-def _stored(levels: Sequence[NDArray[np.float32]]) -> NDArray[np.uint16]:
-    """Return grey levels from 0 to 1 as the values of a DICOM film."""
-    return np.stack([np.rint(((1 << BITS) - 1) * frame).astype(np.uint16) for frame in levels])
+    return KeptFilms(tuple(pictures), film if len(film) <= SMALL_BYTES else b"")
 
 
 def header_of(one: Shown, window: float, number: int, study: dict[str, Any]) -> XaHeader:

@@ -48,31 +48,22 @@ def put_title(picture: "Picture", words: str, left: float, base: float) -> None:
 
 def length_bar(picture: "Picture", width_mm: float, corner: tuple[int, int], size: tuple[int, int]) -> None:
     """Draw a bar of a round length in mm into the panel at a corner, whose width shows `width_mm`."""
-    from PIL import ImageDraw
+    from PIL import Image, ImageDraw
 
     length_mm = next((step for step in (20.0, 10.0, 5.0, 2.0, 1.0) if step < 0.3 * width_mm), 0.5)
     left, y = corner[0] + 0.04 * size[0], corner[1] + 0.95 * size[1]
     right, half = left + length_mm / width_mm * size[0], 0.5 * points_px(1.6)
     words, place = f"{length_mm:g} mm", (left, y - 0.025 * size[1])
     box = ImageDraw.Draw(picture).textbbox(place, words, font=font(7), anchor="ld")
-    _chip(picture, (round(box[0]) - 2, round(box[1]) - 2, round(box[2]) + 2, round(box[3]) + 2))
+    corners = (round(box[0]) - 2, round(box[1]) - 2, round(box[2]) + 2, round(box[3]) + 2)
+    part = picture.crop(corners)  # brightened, so that letters on it are read easily
+    picture.paste(Image.blend(part, Image.new("RGB", part.size, "white"), CHIP), corners[:2])
     ImageDraw.Draw(picture).rectangle((left, y - half, right, y + half), fill=INK)
     _write(picture, words, place, 7, INK, "ld")
 
 
-def _chip(picture: "Picture", box: tuple[int, int, int, int]) -> None:
-    """Brighten a box of a picture, so that letters on it are read easily."""
-    from PIL import Image
-
-    part = picture.crop(box)
-    picture.paste(Image.blend(part, Image.new("RGB", part.size, "white"), CHIP), box[:2])
-
-
 def color_bar(picture: "Picture", colors: Floats, span: tuple[float, float], words: str) -> None:
-    """Draw a color bar with ticks at the foot of a picture.
-
-    Shapes: `colors` (n, 3).
-    """
+    """Draw a bar of colors (n, 3) with ticks at the foot of a picture."""
     from PIL import Image, ImageDraw
 
     left, right = round(0.30 * picture.width), round(0.70 * picture.width)

@@ -12,23 +12,30 @@ from typing import Final
 import numpy as np
 
 from vstent.anatomy.landing_zones import neck_span_mm
-from vstent.devices.stent import Deployment, tube_faces
+from vstent.deployment.sketch import bed, sketch
+from vstent.devices.design import Design, Size, widest_mm
+from vstent.devices.stent import Deployment, Landing, Stent, tube_faces
 from vstent.devices.treatment import BARE
 from vstent.geometry.surface import Surface
-from vstent.geometry.vessel import Anatomy, Vessel
-from vstent.kernels.arrays import Floats, Ints
+from vstent.geometry.vessel import PARENT, Anatomy, Centerline, Opening, Path, Vessel
+from vstent.kernels.arrays import Floats
 from vstent.reporting.figures import Plate, Shot
-from vstent.reporting.freestanding import freestanding_plate
 from vstent.reporting.node_rule import NodeRule
 from vstent.reporting.scene import (
+    INK_COLOUR,
+    STEEL_COLOUR,
+    WALL_COLOUR,
     Implants,
     LineLayer,
     MeshLayer,
     Scene,
+    closed_layer,
     curves_layer,
     device_title,
     implant_titles,
     round_up,
+    scales_of,
+    titled,
     view_of,
 )
 from vstent.reporting.thinning import some_frames, thin_frames, thin_surface
@@ -36,6 +43,8 @@ from vstent.units import counted
 
 SPHERE_STEP: Final = 0.9
 """Distance between drawn spheres as a fraction of their radius."""
+SPHERE_NODES: Final = (17, 32)
+"""Number of nodes of a drawn sphere from pole to pole, and around."""
 FRAMES: Final = 4
 """Number of contours drawn of an expansion."""
 MESH_MM: Final = 3.0
@@ -44,11 +53,18 @@ LARGER: Final = 1.02
 """Ratio of the wall's areas before and after trimming from which both are drawn."""
 RINGS: Final = 28
 """Largest number of rows of the initial contour that are drawn as lines."""
-_SPHERE: Final = (0.36, 0.55, 0.72)
-_STEEL: Final = (0.58, 0.63, 0.68)
-_INK: Final = (0.10, 0.17, 0.20)
-_WALL: Final = (0.62, 0.68, 0.73)
-"""Colors of spheres, contours, lines and wall: red, green and blue, 0 to 1."""
+ROOM: Final = 1.4
+"""Diameter of the tube around a free device, as a multiple of the free diameter, so that no wire touches it."""
+LONGER: Final = 2.0
+"""Length of that tube as a multiple of the label length."""
+COLUMNS: Final = 64
+"""Number of nodes around that tube."""
+TILT: Final = 0.25
+"""Angle in rad by which a free device is turned toward the eye, so that its lumen is seen."""
+_CONTOUR: Final = (0.58, 0.63, 0.68)
+"""Color of contours: red, green and blue, 0 to 1."""
+
+Layers = tuple[MeshLayer | LineLayer, ...]
 
 
 def method_plates(
@@ -56,27 +72,66 @@ def method_plates(
 ) -> list[Plate | NodeRule]:
     """Return the pictures of the steps from the patient's artery to the deployed devices, in that order."""
     found: list[Plate | NodeRule] = []
-    if whole is not None and _is_trimmed(whole, anatomy):
+    if whole is not None and whole.lumen.areas_mm2.sum() > LARGER * anatomy.vessel.lumen.areas_mm2.sum():
         found.append(_trimming(whole, scene))
     found += [_restoration(scene), _spheres(anatomy, scene)]
-    titled = [
-        (title, deployed[key])
-        for name, deployed in implants.items()
-        for key, title in implant_titles(deployed, f"{name}: ").items()
-    ]
-    if titled:
-        stents = {device_title(one): one.stent for _, one in titled}
-        found = [freestanding_plate(stents, scene, anatomy), *found]
-        found += [_first_contours(titled, scene), _triangles(anatomy, titled, scene), NodeRule()]
+    deployments = [(title, deployment) for _, _, title, deployment in titled(implants)]
+    if deployments:
+        stents = {device_title(one): one.stent for _, one in deployments}
+        found = [_free(stents, scene, anatomy), *found]
+        found += [_first_contours(deployments, scene), _triangles(anatomy, deployments, scene), NodeRule()]
         for name, deployed in implants.items():
             found += [_expansion(name, number, deployed, anatomy, scene) for number in range(len(deployed))]
         found.append(_fitted(scene))
     return found
 
 
-def _is_trimmed(whole: Vessel, anatomy: Anatomy) -> bool:
-    """Return whether a part of the vessel was removed that is worth a picture."""
-    return whole.lumen.areas_mm2.sum() > LARGER * anatomy.vessel.lumen.areas_mm2.sum()
+def _free(stents: Mapping[str, Stent], scene: Scene, anatomy: Anatomy) -> Plate:
+    """Return the picture of devices outside an artery (fig. 1)."""
+    layers = [wire_layer(free_device(stent.design, stent.size)) for stent in stents.values()]
+    axes = np.array([[1.0, 0, 0], [0, np.cos(TILT), np.sin(TILT)], [0, -np.sin(TILT), np.cos(TILT)]])
+    axes = axes @ np.array([[np.cos(TILT), 0, np.sin(TILT)], [0, 1, 0], [-np.sin(TILT), 0, np.cos(TILT)]])
+    shots = [
+        Shot(title, (layer,), view_of("free", axes, layer.points_mm))
+        for title, layer in zip(stents, layers, strict=True)
+    ]
+    caption = (
+        "The devices outside an artery, at their free diameter, colored by the diameter of their wires or the width of "
+        "their struts (Zhong et al. 2016, fig. 1)."
+    )
+    shown = replace(scene, scales=scales_of(layers, anatomy))
+    return Plate("free", "The devices outside an artery", caption, shown, shots, "wire_diameter")
+
+
+def free_device(design: Design, size: Size) -> Stent:
+    """Return a device at its free diameter, along the x axis: in a straight tube so wide that it touches nothing."""
+    radius_mm, length_mm = 0.5 * ROOM * widest_mm(design, size), LONGER * size.length_mm
+    along = np.linspace(0.0, length_mm, max(8, round(length_mm / 0.2)))
+    turn = np.linspace(0.0, 2 * np.pi, COLUMNS, endpoint=False)
+    ring = radius_mm * np.stack([0 * turn, np.cos(turn), np.sin(turn)], axis=1)
+    points = np.stack([along, 0 * along, 0 * along], axis=1)
+    wall = Surface((points[:, None] + ring).reshape(-1, 3), tube_faces(len(along), COLUMNS))
+    way, area_mm2 = np.array([1.0, 0.0, 0.0]), float(np.pi * radius_mm**2)
+    ends = Opening(points[0], -way, area_mm2, "inlet"), Opening(points[-1], way, area_mm2, "outlet_1")
+    axis = Centerline(points, np.full(len(along), radius_mm))
+    is_restored = np.zeros(len(wall.vertices_mm), dtype=bool)
+    parent = Path(PARENT, axis, axis.inscribed_radius_mm, wall, is_restored)
+    tube = Anatomy(Vessel(wall, ends, (axis,)), (parent,), ())
+    return sketch(bed(design, size, tube), Landing(0.5 * length_mm)).stent
+
+
+def wire_layer(stent: Stent) -> LineLayer:
+    """Return the wires of a device, colored by their diameter in um."""
+    return LineLayer(
+        "free",
+        "",
+        STEEL_COLOUR,
+        stent.wire_points_mm,
+        stent.wire_starts,
+        stent.wire_diameter_um / 2000,
+        scale="wire_diameter",
+        values=stent.wire_diameter_um[stent.point_wires],
+    )
 
 
 def _trimming(whole: Vessel, scene: Scene) -> Plate:
@@ -84,12 +139,12 @@ def _trimming(whole: Vessel, scene: Scene) -> Plate:
     surface, _ = thin_surface(whole.lumen, 60_000)
     profile = scene.view("profile")
     view = view_of("whole", profile.axes, surface.vertices_mm)
-    lumen = scene.pick(("lumen",), BARE)
-    untrimmed = MeshLayer("untrimmed", "", _WALL, "", np.zeros(0), surface)
+    lumen = _with_opacity(scene, ("lumen",), 1.0)
+    untrimmed = MeshLayer("untrimmed", "", WALL_COLOUR, surface)
     shots = [
         Shot("The vessel before it is trimmed", (untrimmed,), view),
-        Shot("The part that is kept", (replace(untrimmed, opacity=0.16), *_opaque(lumen)), view),
-        Shot("Enlarged", _opaque(lumen), profile),
+        Shot("The part that is kept", (replace(untrimmed, opacity=0.16), *lumen), view),
+        Shot("Enlarged", lumen, profile),
     ]
     caption = (
         "The vessel of the scan or surface before it is trimmed, and the part that is kept around the sac (Zhong et "
@@ -100,14 +155,12 @@ def _trimming(whole: Vessel, scene: Scene) -> Plate:
 
 def _restoration(scene: Scene) -> Plate:
     """Return the picture of the removal of the sac."""
-    profile = scene.view("profile")
-    lumen, landing = scene.pick(("lumen",), BARE), scene.pick(("continued", "landing"), BARE)
-    cut = scene.pick(("lumen", "sac", "neck"), BARE)
-    shots = [
-        Shot("The wall as found", _opaque(lumen), profile),
-        Shot("The sac and its neck", cut, profile),
-        Shot("The parent artery, with the sac removed", landing, profile),
-    ]
+    looks = (
+        ("The wall as found", _with_opacity(scene, ("lumen",), 1.0)),
+        ("The sac and its neck", scene.pick(("lumen", "sac", "neck"), BARE)),
+        ("The parent artery, with the sac removed", scene.pick(("continued", "landing"), BARE)),
+    )
+    shots = [Shot(title, layers, scene.view("profile")) for title, layers in looks]
     caption = (
         "The wall as found; the sac (red), cut off along its neck (red line); and the parent artery with sac "
         "and side branches closed, against which a device expands."
@@ -116,12 +169,22 @@ def _restoration(scene: Scene) -> Plate:
 
 
 def _spheres(anatomy: Anatomy, scene: Scene) -> Plate:
-    """Return the picture of the axis and its maximum inscribed spheres."""
-    spheres = _bead_layer(anatomy)
-    shots = [
-        Shot("In profile", (*scene.pick(("lumen", "axis"), BARE), spheres), scene.view("profile")),
-        Shot("Frontal", (*scene.pick(("lumen", "axis"), BARE), spheres), scene.view("frontal")),
-    ]
+    """Return the picture of the axis and its maximum inscribed spheres, which are one translucent layer."""
+    axis = anatomy.parent.axis
+    at_mm = [0.0]
+    while at_mm[-1] < axis.length_mm:
+        radius_mm = float(np.interp(at_mm[-1], axis.abscissa_mm, axis.inscribed_radius_mm))
+        at_mm.append(at_mm[-1] + SPHERE_STEP * radius_mm)
+    centers, radii = axis.at(np.array(at_mm[:-1])), np.interp(at_mm[:-1], axis.abscissa_mm, axis.inscribed_radius_mm)
+    rows, columns = SPHERE_NODES
+    polar = np.linspace(0.01, np.pi - 0.01, rows)  # open at the poles
+    polar, turn = np.meshgrid(polar, np.linspace(0, 2 * np.pi, columns, endpoint=False), indexing="ij")
+    unit = np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)], axis=-1)
+    vertices = (centers[:, None] + radii[:, None, None] * unit.reshape(-1, 3)).reshape(-1, 3)
+    faces = tube_faces(rows, columns)[:, ::-1]
+    beads = Surface(vertices, np.concatenate([faces + k * rows * columns for k in range(len(centers))]))
+    layers = (*scene.pick(("lumen", "axis"), BARE), MeshLayer("spheres", "", (0.36, 0.55, 0.72), beads, 0.30))
+    shots = [Shot("In profile", layers, scene.view("profile")), Shot("Frontal", layers, scene.view("frontal"))]
     caption = (
         "The axis of the parent artery (blue line) with its maximum inscribed spheres, which set the diameter "
         "of the initial contour."
@@ -129,37 +192,17 @@ def _spheres(anatomy: Anatomy, scene: Scene) -> Plate:
     return Plate("spheres", "Centerline and maximum inscribed spheres", caption, scene, shots)
 
 
-def _bead_layer(anatomy: Anatomy) -> MeshLayer:
-    """Return the maximum inscribed spheres along the axis as one translucent layer."""
-    axis = anatomy.parent.axis
-    at_mm = [0.0]
-    while at_mm[-1] < axis.length_mm:
-        radius_mm = float(np.interp(at_mm[-1], axis.abscissa_mm, axis.inscribed_radius_mm))
-        at_mm.append(at_mm[-1] + SPHERE_STEP * radius_mm)
-    stations = np.array(at_mm[:-1])
-    centers, radii = axis.at(stations), np.interp(stations, axis.abscissa_mm, axis.inscribed_radius_mm)
-    points, faces = _unit_sphere()
-    n = len(points)
-    vertices = (centers[:, None] + radii[:, None, None] * points).reshape(-1, 3)
-    beads = Surface(vertices, np.concatenate([faces + k * n for k in range(len(centers))]))
-    return MeshLayer("spheres", "", _SPHERE, "", np.zeros(0), beads, 0.30)
-
-
-def _unit_sphere(rows: int = 17, columns: int = 32) -> tuple[Floats, Ints]:
-    """Return points (n, 3) and triangles (m, 3) of a sphere of radius 1, open at the poles."""
-    polar, turn = np.meshgrid(
-        np.linspace(0.01, np.pi - 0.01, rows), np.linspace(0, 2 * np.pi, columns, endpoint=False), indexing="ij"
-    )
-    points = np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)], axis=-1)
-    return points.reshape(-1, 3), tube_faces(rows, columns)[:, ::-1]
-
-
-def _first_contours(titled: Sequence[tuple[str, Deployment]], scene: Scene) -> Plate:
-    """Return the picture of the contour of each device before the first iteration."""
+def _first_contours(deployments: Sequence[tuple[str, Deployment]], scene: Scene) -> Plate:
+    """Return the picture of the contour of each device before the first iteration, with some of its rows as lines."""
     shots = []
-    for title, deployment in titled:
-        layers = (*scene.pick(("axis",), BARE), *_contour_layers(deployment.history_mm[0]))
-        shots.append(Shot(title, (*_glass(scene), *layers), scene.view("profile")))
+    for title, deployment in deployments:
+        nodes_mm = deployment.history_mm[0]
+        rows, columns = nodes_mm.shape[:2]
+        some = np.unique(np.linspace(0, rows - 1, min(rows, RINGS)).astype(int))
+        contour = MeshLayer("first", "", _CONTOUR, Surface(nodes_mm.reshape(-1, 3), tube_faces(rows, columns)))
+        rings = closed_layer("rings", nodes_mm[some], 0.02, INK_COLOUR)
+        layers = (*_glass(scene), *scene.pick(("axis",), BARE), contour, rings)
+        shots.append(Shot(title, layers, scene.view("profile")))
     caption = (
         "The contour before the first iteration, in the parent artery (glass): rows of nodes on planes across "
         "the axis, each as wide as the maximum inscribed sphere. Some rows are drawn as lines."
@@ -167,11 +210,11 @@ def _first_contours(titled: Sequence[tuple[str, Deployment]], scene: Scene) -> P
     return Plate("first", "The initial contour", caption, scene, shots)
 
 
-def _triangles(anatomy: Anatomy, titled: Sequence[tuple[str, Deployment]], scene: Scene) -> Plate:
+def _triangles(anatomy: Anatomy, deployments: Sequence[tuple[str, Deployment]], scene: Scene) -> Plate:
     """Return the picture of the triangle mesh of each contour near the neck, before and after the expansion."""
     profile, shots = scene.view("profile"), []
-    middle_mm = _middle_mm(anatomy)
-    for title, deployment in titled:
+    middle_mm = anatomy.parent.axis.at(np.array([np.mean(neck_span_mm(anatomy))]))[0]
+    for title, deployment in deployments:
         history_mm = deployment.history_mm
         for words, nodes_mm in (("initial", history_mm[0]), ("deployed", history_mm[-1])):
             near = np.linalg.norm(nodes_mm.mean(axis=1) - middle_mm, axis=1) < MESH_MM
@@ -185,31 +228,13 @@ def _triangles(anatomy: Anatomy, titled: Sequence[tuple[str, Deployment]], scene
     return Plate("mesh", "The triangle mesh of the contour", caption, scene, shots)
 
 
-def _middle_mm(anatomy: Anatomy) -> Floats:
-    """Return the point (3,) of the axis at the middle of the neck, or without a sac of the artery."""
-    return anatomy.parent.axis.at(np.array([np.mean(neck_span_mm(anatomy))]))[0]
-
-
-def mesh_layers(nodes_mm: Floats) -> tuple[MeshLayer | LineLayer, ...]:
-    """Return a contour as a surface and the edges of its triangles as lines.
-
-    Shapes: `nodes_mm` (rows, columns, 3).
-    """
-    rows, columns = nodes_mm.shape[:2]
-    surface = Surface(nodes_mm.reshape(-1, 3), tube_faces(rows, columns))
+def mesh_layers(nodes_mm: Floats) -> tuple[MeshLayer, LineLayer]:
+    """Return a contour (rows, columns, 3) as a surface and the edges of its triangles as lines."""
+    surface = Surface(nodes_mm.reshape(-1, 3), tube_faces(*nodes_mm.shape[:2]))
     corners = np.concatenate([surface.faces[:, [0, 1]], surface.faces[:, [1, 2]], surface.faces[:, [2, 0]]])
     edges = np.unique(np.sort(corners, axis=1), axis=0)
-    lines = curves_layer("edges", list(surface.vertices_mm[edges]), 0.008, _INK)
-    return MeshLayer("mesh", "", _STEEL, "", np.zeros(0), surface), lines
-
-
-def _contour_layers(nodes_mm: Floats) -> tuple[MeshLayer | LineLayer, ...]:
-    """Return a contour (rows, columns, 3) as a surface and some of its rows as lines."""
-    rows, columns = nodes_mm.shape[:2]
-    surface = Surface(nodes_mm.reshape(-1, 3), tube_faces(rows, columns))
-    some = np.unique(np.linspace(0, rows - 1, min(rows, RINGS)).astype(int))
-    rings = [np.concatenate([nodes_mm[row], nodes_mm[row, :1]]) for row in some]
-    return MeshLayer("first", "", _STEEL, "", np.zeros(0), surface), curves_layer("rings", rings, 0.02, _INK)
+    lines = curves_layer("edges", surface.vertices_mm[edges], 0.008, INK_COLOUR)
+    return MeshLayer("mesh", "", _CONTOUR, surface), lines
 
 
 def _expansion(name: str, number: int, deployed: Mapping[str, Deployment], anatomy: Anatomy, scene: Scene) -> Plate:
@@ -222,12 +247,10 @@ def _expansion(name: str, number: int, deployed: Mapping[str, Deployment], anato
     for count, nodes_mm, gap_mm in zip(some_frames(deployment, FRAMES), frames_mm, gaps_mm, strict=True):
         surface = replace(contour.surface, vertices_mm=nodes_mm)
         layer = replace(contour, surface=surface, values=gap_mm, frames_mm=None, frame_values=None)
-        words = (
-            f"after {counted(count, 'iteration')}, {100 * reached[count]:.0f} % of the nodes terminated"
-            if count
-            else "initial contour"
-        )
-        shots.append(Shot(words[:1].upper() + words[1:], (*_glass(scene), layer), scene.view("profile")))
+        words = "Initial contour"
+        if count:
+            words = f"After {counted(count, 'iteration')}, {100 * reached[count]:.0f} % of the nodes terminated"
+        shots.append(Shot(words, (*_glass(scene), layer), scene.view("profile")))
     # Earlier contours have larger gaps than the deployed device, so its scale would be too narrow.
     gap = scene.scale("wall_gap")
     wide = replace(gap, high=round_up(max(gap.high, float(np.percentile(gaps_mm[0], 98)))))
@@ -243,27 +266,21 @@ def _expansion(name: str, number: int, deployed: Mapping[str, Deployment], anato
 
 def _fitted(scene: Scene) -> Plate:
     """Return the picture of the wires in the parent artery and in the patient's own artery."""
-    profile = scene.view("profile")
-    shots = [
-        shot
-        for pane, title in scene.panes[1:]
-        for shot in (
-            Shot(f"{title}: in the parent artery", (*_glass(scene), *scene.pick(("wires",), pane)), profile),
-            Shot(
-                f"{title}: in the patient's artery", scene.pick(("lumen", "continued", "wires", "neck"), pane), profile
-            ),
-        )
-    ]
+    shots = []
+    for pane, title in scene.panes[1:]:
+        own = scene.pick(("lumen", "continued", "wires", "neck"), pane)
+        parent = (*_glass(scene), *scene.pick(("wires",), pane))
+        shots.append(Shot(f"{title}: in the parent artery", parent, scene.view("profile")))
+        shots.append(Shot(f"{title}: in the patient's artery", own, scene.view("profile")))
     caption = "The wires on the expanded contour, and in the patient's own artery with its sac (neck: red line)."
     return Plate("fitted", "The deployed devices", caption, scene, shots)
 
 
-def _glass(scene: Scene) -> tuple[MeshLayer | LineLayer, ...]:
-    """Return the layers of the parent artery, translucent."""
-    layers = (layer for layer in scene.pick(("landing",), BARE) if isinstance(layer, MeshLayer))
-    return tuple(replace(layer, opacity=0.18) for layer in layers)
+def _glass(scene: Scene) -> Layers:
+    """Return the parent artery, translucent."""
+    return _with_opacity(scene, ("landing",), 0.18)
 
 
-def _opaque(layers: tuple[MeshLayer | LineLayer, ...]) -> tuple[MeshLayer | LineLayer, ...]:
-    """Return layers with their meshes made opaque."""
-    return tuple(replace(layer, opacity=1.0) if isinstance(layer, MeshLayer) else layer for layer in layers)
+def _with_opacity(scene: Scene, ids: tuple[str, ...], opacity: float) -> Layers:
+    """Return the surfaces among the layers with these ids, with another opacity."""
+    return tuple(replace(layer, opacity=opacity) for layer in scene.pick(ids, BARE) if isinstance(layer, MeshLayer))

@@ -68,15 +68,7 @@ class Packer:
 def message(
     layers: Iterable[MeshLayer | LineLayer], scales: Iterable[Scale] = (), views: Iterable[View] = (), **more: Any
 ) -> bytes:
-    """Return layers, scales and views as one message for the page.
-
-    Parameters
-    ----------
-    layers : meshes and lines.
-    scales : color scales that the layers use.
-    views : directions that the page offers.
-    more : further entries of the manifest.
-    """
+    """Return layers, color scales and views, and further entries of the manifest, as one message for the page."""
     packer = Packer()
     manifest = {
         "scales": [_scale(scale, packer) for scale in scales],
@@ -87,13 +79,7 @@ def message(
 
 
 def pack(scene: Scene, notes: dict[str, str]) -> tuple[dict[str, Any], str]:
-    """Return the manifest of a scene and its bytes in base64.
-
-    Parameters
-    ----------
-    scene : the scene.
-    notes : one line of text per pane, by the name of the pane.
-    """
+    """Return the manifest of a scene, with a line of text per pane by its name, and its bytes in base64."""
     packer = Packer()
     manifest = {
         "version": 1,

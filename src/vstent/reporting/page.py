@@ -2,36 +2,28 @@
 
 import base64
 import hashlib
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from markupsafe import Markup
+from numba import config
 
 from vstent.devices.stent import Deployment
 from vstent.devices.treatment import BARE
 from vstent.flow.settings import LATTICE, OPENFOAM
-from vstent.reporting import bands
 from vstent.reporting.definitions import DEFINITIONS, HEADLINES, OF_PULSE, Definition
-from vstent.reporting.drawing import Drawing, in_threads
+from vstent.reporting.drawing import Drawing
 from vstent.reporting.figures import Picture
-from vstent.reporting.films import KeptFilms
 from vstent.reporting.packing import pack
 from vstent.reporting.quality import OF_GRADES, Quality, qualities, unusable
-from vstent.reporting.quantities import (
-    Change,
-    Quantity,
-    base_of,
-    compare,
-    flatten,
-    opening_rows,
-    unit_of,
-)
-from vstent.reporting.scene import Scene, implant_titles
-from vstent.reporting.uncertainty import Varied, uncertainty_of
+from vstent.reporting.quantities import Change, Quantity, base_of, compare, flatten, opening_rows, unit_of
+from vstent.reporting.scene import Scene, titled
+from vstent.reporting.uncertainty import Varied, band_rows, how_sure, uncertainty_of
+from vstent.units import counted
 
 if TYPE_CHECKING:
     from vstent.study.pipeline import CaseResult
@@ -83,7 +75,7 @@ class Contents:
     changes: list[Change]
     """Flow metrics of the bare artery and with each treatment."""
     implants: list[dict[str, Any]]
-    """One entry per implant: title, words, advice, quantities, facts."""
+    """One entry per implant: title, words, advice, quantities, how_sure, bands, facts."""
     openings: list[tuple[str, str, str, str]]
     """Role, diameter, area and center of every opening of the vessel, as text."""
     is_pulse: bool
@@ -124,6 +116,27 @@ class Contents:
         return qualities(self.metrics, dict(self.treatments))
 
     @property
+    def unpaired(self) -> list[tuple[str, list[Quantity]]]:
+        """Ratios of the flow, and its metrics that exist on one side only, by title."""
+        paired, titles = {row.before.path for row in self.changes}, {BARE: "Before"} | dict(self.treatments)
+        found = []
+        for name, treatment in self.metrics.get("treatments", {}).items():
+            title, values = titles.get(name, name), flatten(treatment.get("flow", {}), ("flow", name))
+            found.append((f"{title}: ratios", flatten(treatment.get("change", {}), ("change", name))))
+            found.append((title, [value for value in values if value.path[2:] not in paired]))
+        return [(title, values) for title, values in found if values]
+
+    @property
+    def other(self) -> list[Quantity]:
+        """Metrics that no other section shows."""
+        top = {key: value for key, value in self.metrics.items() if key not in ("vessel", "treatments")}
+        treatments = {
+            name: {key: value for key, value in treatment.items() if key not in SHOWN}
+            for name, treatment in self.metrics.get("treatments", {}).items()
+        }
+        return flatten(top) + flatten(treatments)
+
+    @property
     def definitions(self) -> list[tuple[Definition, str]]:
         """Definition and unit of every metric, sorted by name.
 
@@ -139,17 +152,20 @@ def contents_of(case: "CaseResult", drawing: Drawing | None = None) -> Contents:
     with drawing or Drawing() as drawn:
         scene, metrics = drawn.begin(case), case.metrics
         pictures = drawn.pictures()
+    implants: list[dict[str, Any]] = []
+    told: set[str] = set()
+    for name, key, title, deployment in titled(case.implants):
+        measured = metrics["treatments"][name]["implants"][key]
+        is_told = deployment.stent.design.key in told
+        implants.append(_implant(title, deployment, measured, (name, key), is_told=is_told))
+        told.add(deployment.stent.design.key)
     return Contents(
         name=case.name,
         metrics=metrics,
         scene=scene,
         pictures=pictures,
         changes=compare(metrics, unusable(metrics)),
-        implants=[
-            _implant(title, deployed[key], metrics["treatments"][name]["implants"][key], (name, key))
-            for name, deployed in case.implants.items()
-            for key, title in implant_titles(deployed, f"{name}: ").items()
-        ],
+        implants=implants,
         openings=opening_rows(case.anatomy.vessel.openings),
         is_pulse=any(field.phases for field in case.fields.values()),
         notes=tuple(case.notes),
@@ -158,60 +174,58 @@ def contents_of(case: "CaseResult", drawing: Drawing | None = None) -> Contents:
     )
 
 
-def with_films(told: Contents, films: KeptFilms) -> Contents:
-    """Return the contents of a report with the key frames and the film of its angiogram."""
-    return replace(told, pictures=(*told.pictures, *films.pictures), film=films.animation)
-
-
 def limits_of(case: "CaseResult") -> tuple[str, ...]:
     """Return the limits of a result, one sentence each; those of the flow depend on its settings."""
     flow = case.provenance.get("settings", {}).get("flow")
     if flow is None:
         return OF_CONTOUR, OF_USE
-    of_inlets = [AT_INLETS] if len(case.anatomy.vessel.inlets) > 1 else []
-    return OF_CONTOUR, *_limits_of_flow(flow), *of_inlets, OF_USE
-
-
-def _limits_of_flow(flow: Mapping[str, Any]) -> list[str]:
-    """Return the limits of a flow with these settings, one sentence each."""
-    thins, engine = flow["blood"]["thinning"] is not None, flow["numerics"]["engine"]
+    thins = flow["blood"]["thinning"] is not None
     blood = "Blood is shear-thinning, with parameters from the literature" if thins else "Blood is Newtonian"
-    told = [f"{blood}, and the wall is rigid; {AT_OUTLETS[flow['outlets']]}."]
-    return [*told, OF_DEVICE[engine]] if engine in OF_DEVICE else told
+    limits = [OF_CONTOUR, f"{blood}, and the wall is rigid; {AT_OUTLETS[flow['outlets']]}."]
+    if flow["numerics"]["engine"] in OF_DEVICE:
+        limits.append(OF_DEVICE[flow["numerics"]["engine"]])
+    if len(case.anatomy.vessel.inlets) > 1:
+        limits.append(AT_INLETS)
+    return *limits, OF_USE
 
 
 def as_html(told: Contents) -> str:
     """Return a report laid out as one HTML file."""
     from jinja2 import Environment, PackageLoader
 
-    manifest, scene_bytes = pack(told.scene, _pane_notes(told.headlines))
-    scripts = {"viewer": _script("viewer.js"), "start": _script("start.js")}
+    notes = {}
+    for row in told.headlines[:1]:
+        changes = {name: f"{after.name} {after.text} ({row.of(name)})" for name, after in row.after.items()}
+        notes = {BARE: f"{row.before.name} {row.before.text}"} | changes
+    manifest, scene_bytes = pack(told.scene, notes)
+    # A closing tag in a script would end it in HTML; the policy lets only these exact texts run.
+    scripts = [asset(name).replace("</script", "<\\/script") for name in ("viewer.js", "start.js")]
+    hashes = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
+    with ThreadPoolExecutor(config.NUMBA_NUM_THREADS) as pool:
+        images = list(pool.map(lambda picture: base64.b64encode(picture.webp).decode("ascii"), told.pictures))
+    sections = {
+        "summary": "Summary",
+        "scene": "3-D view",
+        "pictures": "Pictures",
+        "anatomy": "Anatomy",
+        "devices": "Devices" if told.implants else "",
+        "flow": "Blood flow" if told.changes else "",
+        "uncertainty": "Uncertainty" if told.uncertainty else "",
+        "notes": "Notes and limits",
+        "definitions": "Definitions",
+        "provenance": "Method",
+    }
     environment = Environment(loader=PackageLoader("vstent.reporting", "assets"), autoescape=True)
     return environment.get_template("report.html.j2").render(
-        name=told.name,
-        sections=_sections(told),
-        script_hashes=Markup(" ".join(_hash(script) for script in scripts.values())),
+        told=told,
+        sections=[(name, title) for name, title in sections.items() if title],
+        script_hashes=Markup(" ".join(f"'sha256-{digest}'" for digest in hashes)),
         style=Markup(asset("report.css") + asset("viewer.css")),
-        **{name: Markup(script) for name, script in scripts.items()},
-        devices=told.treatments,
-        qualities=told.qualities,
+        scripts=[Markup(script) for script in scripts],
         of_grades=OF_GRADES,
-        summary=told.headlines,
-        pictures=in_threads(_picture, told.pictures),
-        film=base64.b64encode(told.film).decode("ascii"),
-        vessel=told.vessel,
-        openings=told.openings,
-        implants=told.implants,
-        flow=told.changes,
         of_pulse=OF_PULSE,
-        is_pulse=told.is_pulse,
-        flow_only=_flow_only(told.metrics, told.changes, dict(told.treatments)),
-        uncertainty=told.uncertainty,
-        other=_other(told.metrics),
-        notes=told.notes,
-        limits=told.limits,
-        definitions=told.definitions,
-        provenance=told.provenance,
+        pictures=list(zip(told.pictures, images, strict=True)),
+        film=base64.b64encode(told.film).decode("ascii"),
         manifest=manifest,
         scene_bytes=scene_bytes,
     )
@@ -222,97 +236,37 @@ def asset(name: str) -> str:
     return files("vstent.reporting").joinpath("assets", name).read_text(encoding="utf-8")
 
 
-def _script(name: str) -> str:
-    """Return a JavaScript file with closing script tags escaped, so that it can be embedded in HTML."""
-    return asset(name).replace("</script", "<\\/script")
-
-
-def _hash(script: str) -> str:
-    """Return the source expression of a script for a content security policy, so that only this exact text may run."""
-    return f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'"
-
-
-def _sections(told: Contents) -> list[tuple[str, str]]:
-    """Return id and title of every section of the report."""
-    titles = {"summary": "Summary", "scene": "3-D view", "pictures": "Pictures", "anatomy": "Anatomy"}
-    if told.implants:
-        titles["devices"] = "Devices"
-    if told.changes:
-        titles["flow"] = "Blood flow"
-    if told.uncertainty:
-        titles["uncertainty"] = "Uncertainty"
-    titles |= {"notes": "Notes and limits", "definitions": "Definitions", "provenance": "Method"}
-    return list(titles.items())
-
-
-def _picture(picture: Picture) -> dict[str, str]:
-    """Return id, title, caption and base64-encoded WebP of a picture."""
-    words = {"id": picture.id, "title": picture.title, "caption": picture.caption}
-    return {**words, "base64": base64.b64encode(picture.webp).decode("ascii")}
-
-
-def _pane_notes(headlines: list[Change]) -> dict[str, str]:
-    """Return one line per pane: the first headline and its change."""
-    for row in headlines[:1]:
-        notes = {BARE: f"{row.before.name} {row.before.text}"}
-        for name, after in row.after.items():
-            notes[name] = f"{after.name} {after.text} ({row.of(name)})"
-        return notes
-    return {}
-
-
-def _implant(title: str, deployment: Deployment, measured: dict[str, Any], path: tuple[str, str]) -> dict[str, Any]:
-    """Return title, words, advice, quantities and facts of one implant."""
+def _implant(
+    title: str, deployment: Deployment, measured: dict[str, Any], path: tuple[str, str], *, is_told: bool
+) -> dict[str, Any]:
+    """Return title, words, advice, quantities and facts of one implant; the facts only where they are not told yet."""
     stent = deployment.stent
-    values = flatten({key: value for key, value in measured.items() if key != "bands"}, path)
     diameters = ", ".join(f"{d:g}" for d in np.unique(stent.wire_diameter_um))
     wires = f"{len(stent.wire_diameter_um)} wires or struts of {diameters} µm"
     how = "terminated" if deployment.outcome == "terminated" else "stopped at its iteration limit"
-    count = len(deployment.terminated_fraction)
-    steps = f"{count} iteration{'s' if count > 1 else ''}"
+    steps = counted(len(deployment.terminated_fraction), "iteration")
+    facts = [(Quantity((f.name,), None).name, f"{f.confidence}: {f.source}") for f in stent.design.facts]
     return {
         "title": title,
         "words": f"{wires}. The contour {how} after {steps}, in {deployment.seconds:.2f} s.",
         "advice": deployment.advice,
-        "quantities": values,
-        "how_sure": bands.how_sure(measured),
-        "bands": bands.rows(measured),
-        "facts": [(Quantity((f.name,), None).name, f"{f.confidence}: {f.source}") for f in stent.design.facts],
+        "quantities": flatten({key: value for key, value in measured.items() if key != "bands"}, path),
+        "how_sure": how_sure(measured, is_told=is_told),
+        "bands": band_rows(measured),
+        "facts": [] if is_told else facts,
     }
-
-
-def _flow_only(metrics: dict[str, Any], rows: list[Change], titles: dict[str, str]) -> list[tuple[str, list[Quantity]]]:
-    """Return flow metrics that exist on one side only, and ratios, by pane."""
-    paired = {row.before.path for row in rows}
-    found, named = [], {BARE: "Before"} | titles
-    for name, one in metrics.get("treatments", {}).items():
-        values = [q for q in flatten(one.get("flow", {}), ("flow", name)) if q.path[2:] not in paired]
-        found.append((f"{named.get(name, name)}: ratios", flatten(one.get("change", {}), ("change", name))))
-        found.append((named.get(name, name), values))
-    return [(title, values) for title, values in found if values]
-
-
-def _other(metrics: dict[str, Any]) -> list[Quantity]:
-    """Return the metrics that no other section shows."""
-    top = {key: value for key, value in metrics.items() if key not in ("vessel", "treatments")}
-    treatments = {
-        name: {key: value for key, value in one.items() if key not in SHOWN}
-        for name, one in metrics.get("treatments", {}).items()
-    }
-    return flatten(top) + list(flatten(treatments))
 
 
 def _provenance(provenance: dict[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
     """Return the provenance as groups of (name, value) lines by title."""
     parts = {key: value for key, value in provenance.items() if isinstance(value, (dict, list, tuple))}
-    single = {key: value for key, value in provenance.items() if key not in parts}
-    groups = [(key.replace("_", " ").capitalize(), _lines(value)) for key, value in parts.items()]
-    return ([("Run", _lines(single))] if single else []) + [group for group in groups if group[1]]
-
-
-def _lines(values: Any) -> list[tuple[str, str]]:
-    """Return nested values as (name, value) lines."""
-    return [(" · ".join(q.path).replace("_", " "), _plain(q.value)) for q in flatten(values)]
+    groups: dict[str, Any] = {"Run": {key: value for key, value in provenance.items() if key not in parts}}
+    groups |= {key.replace("_", " ").capitalize(): value for key, value in parts.items()}
+    lines = [
+        (title, [(" · ".join(q.path).replace("_", " "), _plain(q.value)) for q in flatten(values)])
+        for title, values in groups.items()
+    ]
+    return [group for group in lines if group[1]]
 
 
 def _plain(value: Any) -> str:

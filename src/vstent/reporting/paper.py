@@ -62,7 +62,8 @@ class Paper:
         """Begin a new page with its footer; without `scale` it has the scale of the page before."""
         from matplotlib.figure import Figure
 
-        self._close()
+        if self._figure is not None:
+            self._pages.savefig(self._figure)
         self._number += 1
         self._scale = scale or self._scale
         self._figure = Figure(figsize=PAGE_IN, facecolor="white")
@@ -71,14 +72,9 @@ class Paper:
         self._put(self._page[0] / 2, 0.45, BADGE, 7.5, color=WARN, ha="center")
         self._put(self._page[0] - RIGHT, 0.45, str(self._number), 7.5, color=QUIET, ha="right")
 
-    def _close(self) -> None:
-        """Write the current page to the document."""
-        if self._figure is not None:
-            self._pages.savefig(self._figure)
-
     def done(self) -> bytes:
         """Return all pages as PDF."""
-        self._close()
+        self._pages.savefig(self._figure)
         self._pages.close()
         return self._stream.getvalue()
 

@@ -1,29 +1,33 @@
 """Report as PDF: A4 pages with searchable text, the pictures, and every metric with its definition."""
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
 from vstent.reporting.definitions import OF_PULSE
-from vstent.reporting.page import Contents, contents_of
+from vstent.reporting.page import Contents
 from vstent.reporting.paper import ACCENT, QUIET, Paper
 from vstent.reporting.quantities import Change, Quantity
 
-if TYPE_CHECKING:
-    from vstent.study.pipeline import CaseResult
-
-
-def report_pdf(case: "CaseResult") -> bytes:
-    """Return the report of a case as PDF; it contains no field of a patient's record."""
-    return as_pdf(contents_of(case))
-
 
 def as_pdf(told: Contents) -> bytes:
-    """Return a report laid out on A4 pages, as PDF."""
+    """Return a report laid out on A4 pages, as PDF; it contains no field of a patient's record."""
     from matplotlib import rc_context
 
     with rc_context({"pdf.fonttype": 42, "font.family": "DejaVu Sans"}):
         paper = Paper(told.name)
-        _summary(paper, told)
+        paper.title(told.name)
+        paper.text(
+            "Virtual stenting report. Blood flow without and with each device; change is with / without − 1, or the "
+            "difference in percentage points."
+        )
+        if told.headlines:
+            paper.heading("Before and after")
+            for one in told.qualities:
+                paper.text(f"{one.sentence} {one.computation.capitalize()}.")
+            _changes(paper, told, told.headlines)
+            if told.is_pulse:
+                paper.text(OF_PULSE)
+        else:
+            paper.text("No blood flow was computed for this case.")
         for picture in told.pictures:
             paper.picture(picture)
         paper.heading("Anatomy")
@@ -31,8 +35,24 @@ def as_pdf(told: Contents) -> bytes:
         paper.heading("Openings")
         paper.table(told.openings, (0.25, 0.2, 0.2, 0.35), head=("Opening", "Diameter", "Area", "Center (LPS)"))
         _devices(paper, told)
-        _flow(paper, told)
-        _uncertainty(paper, told)
+        if told.changes:
+            paper.heading("Blood flow")
+            _changes(paper, told, told.changes)
+        for varied in told.uncertainty:
+            paper.heading(f"Uncertainty: {varied.title}")
+            paper.text(varied.words)
+            rows = [
+                (
+                    row.name,
+                    row.mean,
+                    f"{row.low} to {row.high}",
+                    ", ".join(f"{c} {100 * s:.0f} %" for c, s in row.shares),
+                )
+                for row in varied.rows
+            ]
+            paper.table(
+                rows, (0.27, 0.13, 0.24, 0.36), head=("Result", "Mean", "95 % lie between", "Share of each cause")
+            )
         _words(paper, told)
         return paper.done()
 
@@ -46,24 +66,6 @@ def _named(quantity: Quantity, skip: int) -> str:
     """Return the name of a quantity after the keys that lead to it, without the first `skip` of them."""
     place = " · ".join(quantity.place[skip:]).replace("_", " ")
     return f"{place}: {quantity.name}" if place else quantity.name
-
-
-def _summary(paper: Paper, told: Contents) -> None:
-    """Write the title and the headline metrics."""
-    paper.title(told.name)
-    paper.text(
-        "Virtual stenting report. Blood flow without and with each device; change is with / without − 1, or the "
-        "difference in percentage points."
-    )
-    if told.headlines:
-        paper.heading("Before and after")
-        for one in told.qualities:
-            paper.text(f"{one.sentence} {one.computation.capitalize()}.")
-        _changes(paper, told, told.headlines)
-        if told.is_pulse:
-            paper.text(OF_PULSE)
-    else:
-        paper.text("No blood flow was computed for this case.")
 
 
 def _changes(paper: Paper, told: Contents, rows: list[Change]) -> None:
@@ -94,27 +96,9 @@ def _devices(paper: Paper, told: Contents) -> None:
         if implant["bands"]:
             cells = [(row.name, row.value, f"{row.low} to {row.high}", row.cause) for row in implant["bands"]]
             paper.table(cells, (0.34, 0.13, 0.23, 0.30), head=("Result", "Value", "Band (95 %)", "Largest cause"))
-        paper.text("Sources of the device's numbers:", 8, color=QUIET)
-        paper.table(implant["facts"], (0.26, 0.74))
-
-
-def _flow(paper: Paper, told: Contents) -> None:
-    """Write the section on blood flow where there is one."""
-    if told.changes:
-        paper.heading("Blood flow")
-        _changes(paper, told, told.changes)
-
-
-def _uncertainty(paper: Paper, told: Contents) -> None:
-    """Write the uncertainty intervals of every device."""
-    for varied in told.uncertainty:
-        paper.heading(f"Uncertainty: {varied.title}")
-        paper.text(varied.words)
-        rows = [
-            (row.name, row.mean, f"{row.low} to {row.high}", ", ".join(f"{c} {100 * s:.0f} %" for c, s in row.shares))
-            for row in varied.rows
-        ]
-        paper.table(rows, (0.27, 0.13, 0.24, 0.36), head=("Result", "Mean", "95 % lie between", "Share of each cause"))
+        if implant["facts"]:
+            paper.text("Sources of the device's numbers:", 8, color=QUIET)
+            paper.table(implant["facts"], (0.26, 0.74))
 
 
 def _words(paper: Paper, told: Contents) -> None:

@@ -1,6 +1,6 @@
 """Plan of every treatment, one page per implant: pictures, sizes, landing zones, fit, warnings, alternatives."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Final, NamedTuple
 
@@ -12,12 +12,12 @@ from vstent.deployment.sketch import bed, sketch
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import LandingError
 from vstent.geometry.vessel import Anatomy
-from vstent.plan.rank import Candidate, alternatives
-from vstent.reporting.bands import ends, how_sure
-from vstent.reporting.figures import Picture, Plate, Shot
+from vstent.plan.rank import alternatives
+from vstent.reporting.figures import Picture, Plate, wire_shots
 from vstent.reporting.paper import QUIET, Paper
 from vstent.reporting.quantities import format_value
-from vstent.reporting.scene import Implants, implant_titles, scene_of
+from vstent.reporting.scene import Implants, scene_of, titled
+from vstent.reporting.uncertainty import ends, how_sure
 
 PICTURE_SHARE: Final = 0.19
 """Largest height of the picture as a fraction of the page."""
@@ -25,8 +25,6 @@ MOST_NOTES: Final = 2
 """Largest number of notes on a page; the report has all."""
 HASH_DIGITS: Final = 16
 """Number of digits of the input's SHA-256 that are printed."""
-
-
 SCALES: Final = (1.0, 0.92, 0.84, 0.77, 0.7)
 """Scales of a page, the largest first; the first at which all of it fits is used. Text has 8 points at scale 1."""
 
@@ -48,68 +46,54 @@ class Planned(NamedTuple):
     """Date of the plan, ISO 8601."""
 
 
-class _Page(NamedTuple):
-    """Page of one implant."""
-
-    case: Planned
-    name: str
-    """Name of its treatment."""
-    title: str
-    """Title of the implant."""
-    deployment: Deployment
-    metrics: Mapping[str, Any]
-    picture: Picture
-    alternatives: Sequence[tuple[str, str, str]]
-    """Size, score and reason of other sizes."""
-
-
 def plan_pdf(case: Planned) -> bytes:
-    """Return the plan of every implant as PDF, one A4 page each.
-
-    Parameters
-    ----------
-    case : the case to plan; the flow is not needed.
-    """
+    """Return the plan of every implant as PDF, one A4 page each; the flow is not needed."""
     from matplotlib import rc_context
 
     with rc_context({"pdf.fonttype": 42, "font.family": "DejaVu Sans"}):
         pages = [
-            _Page(
-                case,
-                name,
-                title,
-                deployed[key],
-                case.metrics[name][key],
-                _picture(case, name),
-                _alternative_rows(case, deployed[key].stent),
+            partial(
+                _write,
+                case=case,
+                title=title,
+                deployment=deployment,
+                metrics=case.metrics[name][key],
+                picture=_picture(case, name),
+                others=_alternative_rows(case, deployment.stent),
             )
-            for name, deployed in case.implants.items()
-            for key, title in implant_titles(deployed, f"{name}: ").items()
+            for name, key, title, deployment in titled(case.implants)
         ]
-        scales = [next((scale for scale in SCALES if _fits(page, scale)), SCALES[-1]) for page in pages]
+        scales = [next((scale for scale in SCALES if _fits(case.name, page, scale)), SCALES[-1]) for page in pages]
         paper = Paper(case.name, "plan", scale=scales[0])
         for number, (page, scale) in enumerate(zip(pages, scales, strict=True)):
             if number:
                 paper.turn(scale)
-            _write(paper, page)
+            page(paper)
         return paper.done()
 
 
-def _fits(page: _Page, scale: float) -> bool:
+def _fits(name: str, page: Callable[[Paper], None], scale: float) -> bool:
     """Whether one page at a scale holds all of it."""
-    draft = Paper(page.case.name, "plan", scale=scale)
-    _write(draft, page)
+    draft = Paper(name, "plan", scale=scale)
+    page(draft)
     return draft.count == 1
 
 
-def _write(paper: Paper, page: _Page) -> None:
-    """Write the page of one implant."""
-    case, deployment, metrics = page.case, page.deployment, page.metrics
-    paper.title(f"{case.name}: {page.title}")
+def _write(
+    paper: Paper,
+    case: Planned,
+    title: str,
+    deployment: Deployment,
+    metrics: Mapping[str, Any],
+    picture: Picture,
+    others: Sequence[tuple[str, str, str]],
+) -> None:
+    """Write the page of one implant; `others` are size, score and reason of alternatives."""
+    paper.title(f"{case.name}: {title}")
     paper.text(
         f"Plan of {case.day}. Input SHA-256 {case.source[:HASH_DIGITS]}… Deployed length and fit are predictions."
     )
-    paper.picture(page.picture, most=PICTURE_SHARE)
+    paper.picture(picture, most=PICTURE_SHARE)
     paper.heading("Device and landing")
     paper.table(_device_rows(case.anatomy, deployment, metrics), (0.62, 0.38))
     paper.text(how_sure(metrics), 8)
@@ -120,24 +104,15 @@ def _write(paper: Paper, page: _Page) -> None:
     if len(warnings) > 1 + MOST_NOTES:
         paper.text(f"{len(warnings) - 1 - MOST_NOTES} more notes are in the report.", 8, color=QUIET)
     paper.heading("Alternative sizes")
-    paper.table(page.alternatives, (0.17, 0.13, 0.70), head=("Size", "Score", "Reason"))
+    paper.table(others, (0.17, 0.13, 0.70), head=("Size", "Score", "Reason"))
     paper.text("Blood flow is not part of this plan. Name, date, signature: ______________________________", 8.5)
 
 
 def _picture(case: Planned, name: str) -> Picture:
     """Return a treatment in profile and seen from the sac."""
     scene = scene_of(case.anatomy, {name: case.implants[name]}, {})
-    looks = {
-        "profile": ("In profile", ("lumen", "continued", "sac", "wires", "neck")),
-        "neck": ("Seen from the sac", ("wires", "neck")),
-    }
-    shots = [
-        Shot(title, scene.pick(ids, name), scene.view(view))
-        for view, (title, ids) in looks.items()
-        if any(one.id == view for one in scene.views)
-    ]
     caption = "The device in the patient's artery; the red line is the neck."
-    return Plate("plan", "Position", caption, scene, shots).drawn()
+    return Plate("plan", "Position", caption, scene, wire_shots(scene, name, "sac")).drawn()
 
 
 def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -151,8 +126,14 @@ def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str,
     band = ends(metrics, "deployed_length_mm")
     if band:
         rows.append(("Deployed length, band from the ranges of the device's numbers", band[1:-1]))
-    for end, (first_mm, last_mm) in _zones_mm(anatomy).items():
-        inside = np.linspace(first_mm, last_mm, 51)
+    first_mm, last_mm = anatomy.parent.own_mm
+    proximal_mm, distal_mm = neck_span_mm(anatomy)
+    zones_mm = {
+        "Proximal": (max(first_mm, proximal_mm - ZONE_MM), max(first_mm, proximal_mm)),
+        "Distal": (min(last_mm, distal_mm), min(last_mm, distal_mm + ZONE_MM)),
+    }
+    for end, zone_mm in zones_mm.items():
+        inside = np.linspace(*zone_mm, 51)
         diameters = 2 * np.interp(inside, anatomy.parent.axis.abscissa_mm, anatomy.parent.section_radius_mm)
         words = f"{diameters.min():.2f} to {diameters.max():.2f} mm"
         rows.append((f"{end} landing zone, {ZONE_MM:g} mm: smallest and largest diameter", words))
@@ -171,16 +152,6 @@ def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str,
     ]
 
 
-def _zones_mm(anatomy: Anatomy) -> dict[str, tuple[float, float]]:
-    """Return the landing zones beside the neck within the patient's artery."""
-    first_mm, last_mm = anatomy.parent.own_mm
-    proximal_mm, distal_mm = neck_span_mm(anatomy)
-    return {
-        "Proximal": (max(first_mm, proximal_mm - ZONE_MM), max(first_mm, proximal_mm)),
-        "Distal": (min(last_mm, distal_mm), min(last_mm, distal_mm + ZONE_MM)),
-    }
-
-
 def _length(anatomy: Anatomy, deployment: Deployment) -> str:
     """Return the deployed length with its range."""
     stent = deployment.stent
@@ -197,9 +168,6 @@ def _length(anatomy: Anatomy, deployment: Deployment) -> str:
 def _alternative_rows(case: Planned, stent: Stent) -> Sequence[tuple[str, str, str]]:
     """Return the two best neighboring sizes of a device."""
     found = alternatives(case.anatomy, stent.design, stent.size)
-    return [_alternative(one) for one in found] or [("none fits", "", "")]
-
-
-def _alternative(one: Candidate) -> tuple[str, str, str]:
-    """Return the row of one alternative."""
-    return one.size.label, f"{one.score:.2f}" if one.is_suitable else "unsuitable", one.reason
+    return [(one.size.label, f"{one.score:.2f}" if one.is_suitable else "unsuitable", one.reason) for one in found] or [
+        ("none fits", "", "")
+    ]

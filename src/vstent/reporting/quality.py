@@ -41,20 +41,18 @@ class Quality(NamedTuple):
 
 
 def qualities(metrics: Mapping[str, Any], titles: Mapping[str, str]) -> list[Quality]:
-    """Return the grade of every flow that has one, the flow without a device first.
-
-    Parameters
-    ----------
-    metrics : metrics of a case.
-    titles : titles of the treatments by name.
-    """
-    graded = _graded(metrics)
-    named = {BARE: "Without a device"} | dict(titles)
-    return [
-        Quality(name, title, graded[name]["grade"], "; ".join(graded[name]["reasons"]), _computation(graded[name]))
-        for name, title in named.items()
-        if name in graded
-    ]
+    """Return the grade of every flow that has one, the flow without a device first; `titles` are of treatments."""
+    graded, found = _graded(metrics), []
+    for name, title in ({BARE: "Without a device"} | dict(titles)).items():
+        if name in graded:
+            one = graded[name]
+            spacing, inflow = (format_value(key, one[key]) for key in ("grid_spacing_mm", "inflow_mL_s"))
+            computation = (
+                f"grid spacing {spacing}, {one['cells_count']:,} cells, {one['steps_count']:,} time steps, inflow "
+                f"{inflow} (Reynolds number {one['inlet_reynolds_number_count']:.0f})"
+            )
+            found.append(Quality(name, title, one["grade"], "; ".join(one["reasons"]), computation))
+    return found
 
 
 def unusable(metrics: Mapping[str, Any]) -> frozenset[str]:
@@ -67,12 +65,3 @@ def unusable(metrics: Mapping[str, Any]) -> frozenset[str]:
 def _graded(metrics: Mapping[str, Any]) -> dict[str, Any]:
     """Return the grade of every flow that has one, by treatment."""
     return {name: one["quality"] for name, one in metrics.get("treatments", {}).items() if "quality" in one}
-
-
-def _computation(one: Mapping[str, Any]) -> str:
-    """Return what was computed, in words."""
-    spacing, inflow = (format_value(key, one[key]) for key in ("grid_spacing_mm", "inflow_mL_s"))
-    return (
-        f"grid spacing {spacing}, {one['cells_count']:,} cells, {one['steps_count']:,} time steps, inflow {inflow} "
-        f"(Reynolds number {one['inlet_reynolds_number_count']:.0f})"
-    )

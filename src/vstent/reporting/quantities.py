@@ -27,27 +27,17 @@ UNITS: dict[str, tuple[str, float]] = {
     "percent": ("%", 1.0),
     "ratio": ("", 1.0),
     "count": ("", 1.0),
-    "mmHg": ("mmHg", 1.0),
     "mm3": ("mm³", 1.0),
     "mm2": ("mm²", 1.0),
-    "mm": ("mm", 1.0),
     "um": ("µm", 1.0),
-    "mL": ("mL", 1.0),
-    "kPa": ("kPa", 1.0),
-    "Pa": ("Pa", 1.0),
     "rad": ("°", 180 / math.pi),
     "deg": ("°", 1.0),
-    "ms": ("ms", 1.0),
     "uJ": ("µJ", 1.0),
-    "mJ": ("mJ", 1.0),
     "uW": ("µW", 1.0),
-    "mW": ("mW", 1.0),
     "J": ("µJ", 1e6),
-    "W": ("W", 1.0),
-    "MB": ("MB", 1.0),
-    "s": ("s", 1.0),
+    **{unit: (unit, 1.0) for unit in ("mmHg", "mm", "mL", "kPa", "Pa", "ms", "mJ", "mW", "W", "MB", "s")},
 }
-"""Suffix of a key: its display unit and the factor that converts to it.
+"""Suffix of a key: its display unit and the factor that converts to it; a longer suffix precedes what it ends in.
 
 Angles, fractions and energies are converted to degrees, percent and µJ for display only.
 """
@@ -92,8 +82,10 @@ class Quantity:
         A ratio or a metric of one of several openings has the definition of the metric it derives from.
         """
         key, more = base_of(self.key)
-        known = DEFINITIONS.get(key) or Definition(_spell(split_unit(key)[0]), "", "")
-        return known._replace(name=known.name + more)
+        if key in DEFINITIONS:
+            return DEFINITIONS[key]._replace(name=DEFINITIONS[key].name + more)
+        words = re.sub(r"^n ", "Number of ", split_unit(key)[0].replace("_", " ").strip())
+        return Definition(words[:1].upper() + words[1:] + more, "")
 
     @property
     def name(self) -> str:
@@ -169,13 +161,7 @@ def split_unit(key: str) -> tuple[str, str]:
 
 
 def format_value(key: str, value: Any) -> str:
-    """Return a value with the unit of its key: ``0.412 mL/s``.
-
-    Parameters
-    ----------
-    key : key of the metric, which ends in its unit.
-    value : number, text, boolean or None; several values in a list are separated by commas.
-    """
+    """Return a value with the unit in which its key ends: ``0.412 mL/s``; values of a list are parted by commas."""
     if isinstance(value, (list, tuple)):
         return ", ".join(format_value(key, one) for one in value) or "–"
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
@@ -204,12 +190,7 @@ def format_change(before: Any, after: Any, key: str = "") -> str:
     """Return a relative change in percent, such as ``−35 %``; a dash where it is undefined.
 
     The change of a percentage is a difference in percentage points, such as ``+1.2 points``. The change from zero, or
-    to more than ten times the value, is a difference with the unit of the key, such as ``+39.8 mm³``.
-
-    Parameters
-    ----------
-    before, after : values without and with a device.
-    key : key of the metric, which ends in its unit.
+    to more than ten times the value, is a difference with the unit in which the key ends, such as ``+39.8 mm³``.
     """
     if not all(isinstance(value, (int, float)) and math.isfinite(value) for value in (before, after)):
         return "–"
@@ -225,13 +206,7 @@ def format_change(before: Any, after: Any, key: str = "") -> str:
 
 
 def flatten(metrics: Any, path: tuple[str, ...] = ()) -> list[Quantity]:
-    """Return every value of nested metrics with its path, in order.
-
-    Parameters
-    ----------
-    metrics : nested mappings and lists; a list of plain values counts as one value.
-    path : keys that lead to `metrics`.
-    """
+    """Return every value of nested metrics with its path, begun with `path`; a list of plain values is one value."""
     if isinstance(metrics, dict):
         return [quantity for key, value in metrics.items() for quantity in flatten(value, (*path, str(key)))]
     if isinstance(metrics, (list, tuple)) and any(isinstance(value, dict) for value in metrics):
@@ -266,18 +241,7 @@ def compare(metrics: dict[str, Any], hidden: frozenset[str] = frozenset()) -> li
     rows = []
     for quantity in flows.get(BARE, []):
         found = {name: values[quantity.path] for name, values in after.items() if quantity.path in values}
-        if found and _is_compared(quantity):
+        is_number = isinstance(quantity.value, (int, float)) and not isinstance(quantity.value, bool)
+        if found and is_number and quantity.key not in ERRORS:
             rows.append(Change(quantity, found, hidden))
     return rows
-
-
-def _is_compared(quantity: Quantity) -> bool:
-    """Return whether a quantity is a number whose change with a device is meaningful."""
-    is_number = isinstance(quantity.value, (int, float)) and not isinstance(quantity.value, bool)
-    return is_number and quantity.key not in ERRORS
-
-
-def _spell(words: str) -> str:
-    """Return the words of a key as a display name."""
-    text = re.sub(r"^n ", "Number of ", words.replace("_", " ").strip())
-    return text[:1].upper() + text[1:]

@@ -1,8 +1,7 @@
 """Scene of a case: layers with colors, color scales and views, shared by the viewer and the pictures."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -66,9 +65,9 @@ class Layer:
     """Name of the pane that shows it; empty: all panes."""
     colour: tuple[float, float, float]
     """Red, green and blue, 0 to 1, used where the layer has no scale."""
-    scale: str
+    scale: str = field(default="", kw_only=True)
     """Name of the color scale of the values; empty: `colour` is used."""
-    values: Floats
+    values: Floats = field(default_factory=lambda: np.zeros(0), kw_only=True)
     """(n,) value per vertex or point; empty without a scale."""
 
 
@@ -85,6 +84,11 @@ class MeshLayer(Layer):
     frame_values: Floats | None = None
     """(f, n) values over time; None: static."""
 
+    @property
+    def vertices_mm(self) -> Floats:
+        """(n, 3) points that the values belong to."""
+        return self.surface.vertices_mm
+
 
 @dataclass(frozen=True, eq=False)
 class LineLayer(Layer):
@@ -96,6 +100,11 @@ class LineLayer(Layer):
     """(w + 1,) index of the first point of every polyline, and p at the end."""
     radius_mm: Floats
     """(w,) radius of every polyline."""
+
+    @property
+    def vertices_mm(self) -> Floats:
+        """(p, 3) points that the values belong to."""
+        return self.points_mm
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,20 +159,29 @@ Implants = Mapping[str, Mapping[str, Deployment]]
 """Deployed implants by treatment and id."""
 
 
-def scene_of(anatomy: Anatomy, implants: Implants, fields: Mapping[str, FlowField]) -> Scene:
+def scene_of(anatomy: Anatomy, implants: Implants, flows: Mapping[str, FlowField]) -> Scene:
     """Return the scene of a case, decimated to the resolution of a screen."""
-    treatments = tuple((name, treatment_title(deployed)) for name, deployed in implants.items())
-    layers: list[MeshLayer | LineLayer] = anatomy_layers(anatomy)
-    for name, deployed in implants.items():
-        for deployment in deployed.values():
-            layers += [*device_layers(name, deployment, anatomy), coverage_layer(name, deployment.stent)]
-    for name, field in fields.items():
-        layers += flow_layers(name, field, anatomy)
+    layers = anatomy_layers(anatomy)
+    deployments = [(name, one) for name, deployed in implants.items() for one in deployed.values()]
+    for name, deployment in deployments:
+        stent = deployment.stent
+        points, starts, _ = thin_lines(stent.wire_points_mm, stent.wire_starts, np.zeros(0), 60_000)
+        coverage = 100 * node_coverage(stent).ravel()
+        layers += [
+            contour_layer(name, deployment, anatomy),
+            LineLayer("wires", name, STEEL_COLOUR, points, starts, stent.wire_diameter_um / 2000),
+            MeshLayer("coverage", name, STEEL_COLOUR, stent.contour, scale="coverage", values=coverage),
+        ]
+    for name, flow in flows.items():
+        layers += flow_layers(name, flow, anatomy)
     return Scene(
-        panes=((BARE, "Before (no device)"), *treatments),
+        panes=(
+            (BARE, "Before (no device)"),
+            *((name, treatment_title(deployed)) for name, deployed in implants.items()),
+        ),
         layers=tuple(layers),
         scales=scales_of(layers, anatomy),
-        views=views_of(anatomy, [one for deployed in implants.values() for one in deployed.values()]),
+        views=views_of(anatomy, [deployment for _, deployment in deployments]),
         is_oriented=anatomy.vessel.is_oriented,
         fade_mm=1.2 * float(np.median(anatomy.parent.section_radius_mm)),
     )
@@ -176,16 +194,19 @@ def device_title(deployment: Deployment) -> str:
 
 
 def implant_titles(deployed: Mapping[str, Deployment], before: str = "") -> dict[str, str]:
-    """Return the titles of the implants of a treatment by id.
-
-    Parameters
-    ----------
-    deployed : deployed implants by id.
-    before : text before the titles of several implants; these are numbered in the order of deployment.
-    """
+    """Return the titles of implants by id; several are numbered in their order, with `before` ahead of the number."""
     if len(deployed) == 1:
         return {key: device_title(one) for key, one in deployed.items()}
     return {key: f"{before}{n}. {device_title(one)}" for n, (key, one) in enumerate(deployed.items(), start=1)}
+
+
+def titled(implants: Implants) -> list[tuple[str, str, str, Deployment]]:
+    """Return name of the treatment, id, title and deployment of all implants."""
+    return [
+        (name, key, title, deployed[key])
+        for name, deployed in implants.items()
+        for key, title in implant_titles(deployed, f"{name}: ").items()
+    ]
 
 
 def treatment_title(deployed: Mapping[str, Deployment]) -> str:
@@ -193,14 +214,12 @@ def treatment_title(deployed: Mapping[str, Deployment]) -> str:
     return " + ".join(map(device_title, deployed.values()))
 
 
-_PLAIN: dict[str, Any] = {"scale": "", "values": np.zeros(0)}
-"""Fields of a layer without values."""
-_WALL = (0.62, 0.68, 0.73)
-_SAC = (0.62, 0.13, 0.16)
-_INK = (0.10, 0.17, 0.20)
-_STEEL = (0.33, 0.38, 0.43)
-_ASSUMED = (0.45, 0.36, 0.58)
-"""Colors of wall, sac, lines, devices and assumed artery: red, green and blue, 0 to 1."""
+WALL_COLOUR = (0.62, 0.68, 0.73)
+NECK_COLOUR = (0.72, 0.20, 0.16)
+STEEL_COLOUR = (0.33, 0.38, 0.43)
+INK_COLOUR = (0.10, 0.17, 0.20)
+ASSUMED_COLOUR = (0.45, 0.36, 0.58)
+"""Colors of wall, neck, devices, lines, and of centerlines and assumed arteries: red, green and blue, 0 to 1."""
 ON_SAC_CELLS = 0.2
 """Distance from the sac, in cells, within which a vertex of the wall belongs to it (as in `flow.indices`)."""
 RING_MM = 1.0
@@ -209,168 +228,93 @@ RING_MM = 1.0
 
 def anatomy_layers(anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
     """Return the layers of lumen, landing surface, centerlines, axis, sacs and necks."""
-    lumen, _ = thin_surface(anatomy.vessel.lumen, 40_000)
-    surface = anatomy.parent.landing_surface
-    own = Surface(
-        *triangles.compact(surface.vertices_mm, surface.faces[~anatomy.parent.is_continued[surface.faces].any(axis=1)])
-    )
-    landing, _ = thin_surface(own if any(anatomy.parent.continued_mm) else surface, 24_000)
+    parent, own = anatomy.parent, anatomy.parent.landing_surface
+    is_longer = any(parent.continued_mm)
+    if is_longer:
+        own = Surface(*triangles.compact(own.vertices_mm, own.faces[~parent.is_continued[own.faces].any(axis=1)]))
+    centerlines = [line.points_mm for line in anatomy.vessel.centerlines]
     layers: list[MeshLayer | LineLayer] = [
-        MeshLayer(id="lumen", pane="", colour=_WALL, surface=lumen, opacity=0.16, **_PLAIN),
-        MeshLayer(id="landing", pane="", colour=(0.80, 0.74, 0.66), surface=landing, **_PLAIN),
-        curves_layer("centerlines", [line.points_mm for line in anatomy.vessel.centerlines], 0.05, (0.45, 0.36, 0.58)),
-        curves_layer("axis", [anatomy.parent.axis.points_mm], 0.06, (0.17, 0.32, 0.55)),
+        MeshLayer("lumen", "", WALL_COLOUR, thin_surface(anatomy.vessel.lumen, 40_000)[0], 0.16),
+        MeshLayer("landing", "", (0.80, 0.74, 0.66), thin_surface(own, 24_000)[0]),
+        curves_layer("centerlines", centerlines, 0.05, ASSUMED_COLOUR),
+        curves_layer("axis", [parent.axis.points_mm], 0.06, (0.17, 0.32, 0.55)),
     ]
-    if any(anatomy.parent.continued_mm):
-        layers += [curves_layer("continued", _continued_rings(anatomy), 0.05, _ASSUMED)]
+    if is_longer:  # assumed wall is drawn as rings, so that it does not look like the patient's
+        count = len(parent.axis.points_mm)
+        is_assumed = parent.is_continued.reshape(count, -1).all(axis=1)
+        every = max(1, round(RING_MM / float(np.diff(parent.axis.abscissa_mm).mean())))
+        rings_mm = parent.landing_surface.vertices_mm.reshape(count, -1, 3)[is_assumed][::every]
+        layers.append(closed_layer("continued", rings_mm, 0.05, ASSUMED_COLOUR))
+    for aneurysm in anatomy.aneurysms:
+        layers.append(MeshLayer("sac", "", (0.62, 0.13, 0.16), thin_surface(aneurysm.sac, 12_000)[0], 0.45))
     if anatomy.aneurysms:
-        sacs = [thin_surface(aneurysm.sac, 12_000)[0] for aneurysm in anatomy.aneurysms]
-        rings = [np.vstack([aneurysm.neck_mm, aneurysm.neck_mm[:1]]) for aneurysm in anatomy.aneurysms]
-        layers += [MeshLayer(id="sac", pane="", colour=_SAC, surface=sac, opacity=0.45, **_PLAIN) for sac in sacs]
-        layers += [curves_layer("neck", rings, 0.08, (0.72, 0.20, 0.16))]
+        layers.append(closed_layer("neck", [one.neck_mm for one in anatomy.aneurysms], 0.08, NECK_COLOUR))
     return layers
 
 
-def _continued_rings(anatomy: Anatomy) -> list[Floats]:
-    """Return closed rings of the continued artery, about `RING_MM` apart: assumed wall is not drawn solid."""
-    count = len(anatomy.parent.axis.points_mm)
-    rings_mm = anatomy.parent.landing_surface.vertices_mm.reshape(count, -1, 3)
-    is_assumed = anatomy.parent.is_continued.reshape(count, -1).all(axis=1)
-    every = max(1, round(RING_MM / float(np.diff(anatomy.parent.axis.abscissa_mm).mean())))
-    return [np.vstack([ring, ring[:1]]) for ring in rings_mm[is_assumed][::every]]
+def curves_layer(
+    name: str, curves: Iterable[Floats], radius_mm: float, colour: tuple[float, float, float]
+) -> LineLayer:
+    """Return curves, each (n, 3) points in mm, as one layer without values, shown in every pane."""
+    some = list(curves)
+    starts = np.concatenate([[0], np.cumsum([len(curve) for curve in some])]).astype(np.int32)
+    return LineLayer(name, "", colour, np.concatenate([np.zeros((0, 3)), *some]), starts, np.full(len(some), radius_mm))
 
 
-def curves_layer(name: str, curves: list[Floats], radius_mm: float, colour: tuple[float, float, float]) -> LineLayer:
-    """Return curves as one layer without values, shown in every pane.
-
-    Parameters
-    ----------
-    name : id of the layer.
-    curves : (n, 3) points of every curve in mm.
-    radius_mm : radius of the drawn lines.
-    colour : red, green and blue, 0 to 1.
-    """
-    starts = np.concatenate([[0], np.cumsum([len(curve) for curve in curves])]).astype(np.int32)
-    points = np.concatenate([np.zeros((0, 3)), *curves])
-    radii = np.full(len(curves), radius_mm)
-    return LineLayer(id=name, pane="", colour=colour, points_mm=points, starts=starts, radius_mm=radii, **_PLAIN)
+def closed_layer(name: str, rings: Iterable[Floats], radius_mm: float, colour: tuple[float, float, float]) -> LineLayer:
+    """Return curves, each (n, 3) points in mm, as `curves_layer` does, their ends joined."""
+    return curves_layer(name, [np.vstack([ring, ring[:1]]) for ring in rings], radius_mm, colour)
 
 
-def device_layers(name: str, deployment: Deployment, anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
-    """Return the contour of a device with its expansion over time, and its wires.
-
-    Parameters
-    ----------
-    name : pane that shows them.
-    deployment : the deployment.
-    anatomy : vessel, parent artery and sacs.
-    """
+def contour_layer(name: str, deployment: Deployment, anatomy: Anatomy) -> MeshLayer:
+    """Return the contour of a device with its expansion over time, colored by its gap to the wall."""
     frames_mm, gaps_mm = thin_frames(deployment, anatomy.parent.landing_surface, n_frames=24)
-    stent = deployment.stent
-    points, starts, _ = thin_lines(stent.wire_points_mm, stent.wire_starts, np.zeros(0), 60_000)
-    contour = MeshLayer(
-        id="contour",
-        pane=name,
-        colour=_STEEL,
-        scale="wall_gap",
-        values=gaps_mm[-1],
-        surface=stent.contour,
+    return MeshLayer(
+        "contour",
+        name,
+        STEEL_COLOUR,
+        deployment.stent.contour,
         frames_mm=frames_mm,
         frame_values=gaps_mm,
+        scale="wall_gap",
+        values=gaps_mm[-1],
     )
-    radius_mm = stent.wire_diameter_um / 2000
-    wires = LineLayer(
-        id="wires", pane=name, colour=_STEEL, points_mm=points, starts=starts, radius_mm=radius_mm, **_PLAIN
-    )
-    return [contour, wires]
-
-
-def coverage_layer(name: str, stent: Stent) -> MeshLayer:
-    """Return the contour of a device colored by the local metal coverage in percent."""
-    values = 100 * node_coverage(stent).ravel()
-    return MeshLayer(id="coverage", pane=name, colour=_STEEL, scale="coverage", values=values, surface=stent.contour)
 
 
 def node_coverage(stent: Stent) -> Floats:
-    """Return the metal coverage at every node of a device.
+    """Return the fraction (rows, columns) of a device covered by metal, 0 to 1, at every node.
 
     Coverage is measured on the wires in each quad of the contour and averaged over 7 x 7 quads.
-
-    Parameters
-    ----------
-    stent : the deployed device.
-
-    Returns (rows, columns) fraction of the surface covered by metal, 0 to 1.
     """
     from scipy.ndimage import uniform_filter
 
-    quads = coverage_fractions(stent)
-    smooth = uniform_filter(quads, size=(7, 7), mode=("nearest", "wrap"))
+    smooth = uniform_filter(coverage_fractions(stent), size=(7, 7), mode=("nearest", "wrap"))
     return np.concatenate([smooth, smooth[-1:]])
 
 
-def flow_layers(name: str, field: FlowField, anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
-    """Return the wall colored by its shear stress, and the streamlines.
-
-    Parameters
-    ----------
-    name : pane that shows them.
-    field : the flow.
-    anatomy : vessel, parent artery and sacs.
-    """
-    wall, origin = thin_surface(field.wall, 40_000)
-    shear = MeshLayer(
-        id="shear",
-        pane=name,
-        colour=_WALL,
-        scale="shear",
-        values=field.shear_Pa[origin],
-        surface=wall,
-    )
-    of_sac = [_sac_shear(name, field, one.sac) for one in anatomy.aneurysms[:1]]
-    return [shear, *of_sac, stream_layer(name, field, _seeds_mm(field, anatomy))]
+def flow_layers(name: str, flow: FlowField, anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
+    """Return the wall and the sac's wall, each colored by shear stress on a scale of its own, and the streamlines."""
+    wall, origin = thin_surface(flow.wall, 40_000)
+    layers: list[MeshLayer | LineLayer] = [
+        MeshLayer("shear", name, WALL_COLOUR, wall, scale="shear", values=flow.shear_Pa[origin])
+    ]
+    seeds = [inlet_seeds_mm(flow, anatomy.vessel, N_INLET)]
+    for aneurysm in anatomy.aneurysms[:1]:
+        is_sac = on_sac(flow.wall, aneurysm.sac, ON_SAC_CELLS * flow.finest.cell_size_mm)
+        used, corners = np.unique(flow.wall.faces[is_sac[flow.wall.faces].all(axis=1)], return_inverse=True)
+        sac, origin = thin_surface(Surface(flow.wall.vertices_mm[used], corners.reshape(-1, 3)), 20_000)
+        shear_Pa = flow.shear_Pa[used][origin]
+        layers.append(MeshLayer("sac_shear", name, WALL_COLOUR, sac, scale="sac_shear", values=shear_Pa))
+        seeds.append(neck_seeds_mm(flow, aneurysm.neck, N_NECK))
+    return [*layers, stream_layer(name, flow, np.concatenate(seeds))]
 
 
-def _sac_shear(name: str, field: FlowField, sac: Surface) -> MeshLayer:
-    """Return the wall of the sac colored by its shear stress, on a scale of its own."""
-    is_sac = on_sac(field.wall, sac, ON_SAC_CELLS * field.finest.cell_size_mm)
-    faces = field.wall.faces[is_sac[field.wall.faces].all(axis=1)]
-    used = np.unique(faces)
-    place = np.zeros(len(field.wall.vertices_mm), dtype=np.int32)
-    place[used] = np.arange(len(used))
-    thin, origin = thin_surface(Surface(field.wall.vertices_mm[used], place[faces]), 20_000)
-    values = field.shear_Pa[used][origin]
-    return MeshLayer(id="sac_shear", pane=name, colour=_WALL, scale="sac_shear", values=values, surface=thin)
-
-
-def stream_layer(name: str, field: FlowField, seeds_mm: Floats) -> LineLayer:
-    """Return streamlines colored by speed.
-
-    Parameters
-    ----------
-    name : pane that shows them.
-    field : the flow.
-    seeds_mm : (s, 3) points through which they run.
-    """
-    lines = streamlines(field, seeds_mm)
+def stream_layer(name: str, flow: FlowField, seeds_mm: Floats) -> LineLayer:
+    """Return the streamlines through seeds (s, 3), colored by speed."""
+    lines = streamlines(flow, seeds_mm)
     points, starts, speed = thin_lines(lines.points_mm, lines.starts, lines.speed_m_s, 24_000)
-    return LineLayer(
-        id="streamlines",
-        pane=name,
-        colour=_INK,
-        scale="speed",
-        values=speed,
-        points_mm=points,
-        starts=starts,
-        radius_mm=np.full(len(starts) - 1, 0.025),
-    )
-
-
-def _seeds_mm(field: FlowField, anatomy: Anatomy) -> Floats:
-    """Return seed points (s, 3) of streamlines on the inlets and on the neck of the first sac."""
-    seeds = [inlet_seeds_mm(field, anatomy.vessel, N_INLET)]
-    seeds += [neck_seeds_mm(field, sac.neck, N_NECK) for sac in anatomy.aneurysms[:1]]
-    return np.concatenate(seeds)
+    radius_mm = np.full(len(starts) - 1, 0.025)
+    return LineLayer("streamlines", name, INK_COLOUR, points, starts, radius_mm, scale="speed", values=speed)
 
 
 _SCALES = {
@@ -390,31 +334,25 @@ _OF_FLOW = ("speed", "shear", "sac_shear")
 def scales_of(layers: Sequence[MeshLayer | LineLayer], anatomy: Anatomy) -> tuple[Scale, ...]:
     """Return the color scales in use, each wide enough for all layers that use it.
 
-    The range of a flow scale is set by the values near the sac without a device.
-
-    Parameters
-    ----------
-    layers : all layers; the first one with a flow scale belongs to the flow without a device.
-    anatomy : vessel, parent artery and sacs.
+    The range of a flow scale is set by the values near the first sac in the first layer, without a device.
     """
+    import matplotlib
+
     scales = []
     for name, (title, unit, colour_map, least) in _SCALES.items():
         used = [layer for layer in layers if layer.scale == name and len(layer.values)]
-        if used:
-            near = _about_the_sac(used[0], anatomy) if name in _OF_FLOW else np.zeros(0)
-            highs = [least, *(float(np.percentile(layer.values, 98)) for layer in used)]
-            high = float(np.percentile(near, 98)) if near.any() else max(highs)
-            scales.append(Scale(name, title, unit, 0.0, round_up(high), _colours(colour_map)))
+        if not used:
+            continue
+        high = max([least, *(float(np.percentile(layer.values, 98)) for layer in used)])
+        if name in _OF_FLOW and anatomy.aneurysms:
+            tree = cKDTree(anatomy.aneurysms[0].sac.vertices_mm)
+            away_mm = tree.query(used[0].vertices_mm, distance_upper_bound=BESIDE_SAC_MM)[0]
+            near = used[0].values[away_mm < BESIDE_SAC_MM]
+            high = float(np.percentile(near, 98)) if near.any() else high
+        # The lightest colors of a map would not show on the light background.
+        colours = matplotlib.colormaps[colour_map](np.linspace(0.0, 0.93, 256))[:, :3]
+        scales.append(Scale(name, title, unit, 0.0, round_up(high), colours))
     return tuple(scales)
-
-
-def _about_the_sac(layer: MeshLayer | LineLayer, anatomy: Anatomy) -> Floats:
-    """Return the values (k,) of a layer near the wall of the first sac; empty without a sac."""
-    if not anatomy.aneurysms:
-        return np.zeros(0)
-    points_mm = layer.points_mm if isinstance(layer, LineLayer) else layer.surface.vertices_mm
-    tree = cKDTree(anatomy.aneurysms[0].sac.vertices_mm)
-    return layer.values[tree.query(points_mm, distance_upper_bound=BESIDE_SAC_MM)[0] < BESIDE_SAC_MM]
 
 
 def round_up(value: float) -> float:
@@ -423,47 +361,30 @@ def round_up(value: float) -> float:
     return float(next(step for step in (1, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10) if step >= value / power - 1e-9) * power)
 
 
-def _colours(name: str) -> Floats:
-    """Return 256 colors (256, 3) of a matplotlib color map."""
-    import matplotlib
-
-    # The lightest colors of a map would not show on the light background.
-    return matplotlib.colormaps[name](np.linspace(0.0, 0.93, 256))[:, :3]
-
-
 def views_of(anatomy: Anatomy, deployments: Sequence[Deployment] = ()) -> tuple[View, ...]:
-    """Return the views of a case, the profile of the first sac first.
-
-    Parameters
-    ----------
-    anatomy : vessel, parent artery and sacs.
-    deployments : deployed implants, which the profile view encloses.
-    """
+    """Return the views of a case, first the profile of the first sac, which encloses the deployed implants."""
     points = [deployment.stent.nodes_mm.reshape(-1, 3) for deployment in deployments]
     points += [aneurysm.sac.vertices_mm for aneurysm in anatomy.aneurysms[:1]]
     treated = np.concatenate(points or [anatomy.parent.axis.points_mm])
     whole = anatomy.vessel.lumen.vertices_mm
+
+    def n_hiding(view: View) -> int:
+        """Return the number of points between the eye and the sphere of a view."""
+        offset = (whole - view.center_mm) @ view.axes.T
+        aside_mm = np.linalg.norm(offset[:, :2], axis=1)
+        return int(np.count_nonzero((aside_mm < view.radius_mm) & (offset[:, 2] > view.radius_mm)))
+
     right, up, toward = _profile(anatomy)
-    profile = view_of("profile", np.stack([right, up, toward]), treated)
-    opposite = view_of("profile", np.stack([-right, up, -toward]), treated)
-    views = [profile if _hidden(whole, profile) <= _hidden(whole, opposite) else opposite]
+    sides = [view_of("profile", np.stack(axes), treated) for axes in ((right, up, toward), (-right, up, -toward))]
+    views = [min(sides, key=n_hiding)]
     if anatomy.aneurysms:
         right, up, toward = views[0].axes
         views.append(view_of("neck", np.stack([right, -toward, up]), anatomy.aneurysms[0].neck_mm, 1.3))
-    views += [view_of("frontal", FRONTAL, whole), view_of("lateral", LATERAL, whole)]
-    return tuple(views)
+    return *views, view_of("frontal", FRONTAL, whole), view_of("lateral", LATERAL, whole)
 
 
 def view_of(name: str, axes: Floats, points_mm: Floats, room: float = 1.0) -> View:
-    """Return a view whose sphere encloses points as seen along its axes.
-
-    Parameters
-    ----------
-    name : id of the view.
-    axes : (3, 3) unit rows in LPS: right, up, toward the eye.
-    points_mm : (n, 3) points to enclose.
-    room : factor on the radius of the sphere.
-    """
+    """Return a view whose sphere, its radius times `room`, encloses points (n, 3) as seen along its axes (3, 3)."""
     seen = points_mm @ axes.T
     middle = 0.5 * (seen.min(axis=0) + seen.max(axis=0))
     radius_mm = room * float(np.linalg.norm((seen - middle)[:, :2], axis=1).max())
@@ -484,10 +405,3 @@ def _profile(anatomy: Anatomy) -> Floats:
     up = up - (up @ right) * right
     up = up / np.linalg.norm(up)
     return np.stack([right, up, np.cross(right, up)])
-
-
-def _hidden(points_mm: Floats, view: View) -> int:
-    """Return the number of points (n, 3) between the eye and the sphere of a view."""
-    offset = (points_mm - view.center_mm) @ view.axes.T
-    aside_mm = np.linalg.norm(offset[:, :2], axis=1)
-    return int(np.count_nonzero((aside_mm < view.radius_mm) & (offset[:, 2] > view.radius_mm)))

@@ -11,17 +11,9 @@ from vstent.kernels.arrays import Floats, Ints
 
 
 def thin_surface(surface: Surface, n_faces: int) -> tuple[Surface, Ints]:
-    """Return a surface decimated to about `n_faces` faces.
+    """Return a surface decimated to about `n_faces` faces, and the nearest given vertex (n,) of every new vertex.
 
-    Parameters
-    ----------
-    surface : the surface.
-    n_faces : number of faces above which it is decimated.
-
-    Returns
-    -------
-    surface : the decimated surface, or the given one where it is small enough.
-    origin : (n,) nearest vertex of the given surface for every new vertex.
+    A surface that is small enough is returned as it is.
     """
     if len(surface.faces) <= n_faces:
         return surface, np.arange(len(surface.vertices_mm), dtype=np.int32)
@@ -36,10 +28,7 @@ def thin_surface(surface: Surface, n_faces: int) -> tuple[Surface, Ints]:
 
 
 def thin_lines(points: Floats, starts: Ints, values: Floats, n_points: int) -> tuple[Floats, Ints, Floats]:
-    """Return polylines reduced to about `n_points` points: every k-th point and the last of each line.
-
-    Shapes: `points` (p, 3), `starts` (w + 1,), `values` (p,).
-    """
+    """Return polylines with about `n_points` points (p, 3) and values (p,): every k-th and the last of each line."""
     step = max(1, -(-len(points) // n_points))
     kept = [np.append(np.arange(a, b - 1, step), b - 1) for a, b in itertools.pairwise(starts)]
     chosen = np.concatenate([np.zeros(0, dtype=int), *kept])

@@ -1,11 +1,25 @@
-"""Uncertainty of results as table rows: mean, 95 % interval, and the share of each cause in the variance."""
+"""Uncertainty as text: bands of a deployment from the numbers of its device, and intervals of all results."""
 
+import re
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
-from vstent.reporting.bands import number_name
 from vstent.reporting.quantities import Quantity, format_value
 
+NUMBERS: Final = {
+    "wire_count": "number of wires",
+    "wire_diameter_um": "wire diameter",
+    "braid_angle_rad": "braid angle",
+    "n_columns": "number of cells around",
+    "strut_width_um": "strut width",
+    "strut_thickness_um": "strut thickness",
+    "cell_angle_rad": "cell angle",
+    "free_diameter_margin_mm": "free diameter",
+    "label_length_mm": "length at the label diameter",
+}
+"""Display names of the numbers of the catalogue."""
+HEADLINES: Final = ("deployed_length_mm", "neck_metal_coverage_fraction")
+"""Results that the sentence on a device names."""
 CAUSES: Final = {
     "threshold": "all diameters",
     "landing": "landing",
@@ -14,6 +28,72 @@ CAUSES: Final = {
     "rest": "interplay and chance",
 }
 """Display names of the causes of uncertainty."""
+
+
+class Row(NamedTuple):
+    """Band of one result, as text."""
+
+    name: str
+    """Display name of the result."""
+    value: str
+    """Value with the numbers of the catalogue, with unit."""
+    low: str
+    """Lower end, with unit."""
+    high: str
+    """Upper end, with unit."""
+    cause: str
+    """Number of the device that contributes most, with its share of the variance; empty where there is none."""
+
+
+def number_name(name: str) -> str:
+    """Return the display name of a number of the catalogue; further groups of wires have their number."""
+    group = re.fullmatch(r"wire_(\d+)_(\w+)", name)
+    return f"{NUMBERS[f'wire_{group[2]}']}, group {group[1]}" if group else NUMBERS.get(name, name)
+
+
+def band_rows(implant: Mapping[str, Any]) -> list[Row]:
+    """Return the bands of the metrics of an implant; empty where they or the catalogue entry have none."""
+    found = []
+    for key, band in implant.get("bands", {}).get("results", {}).items():
+        low, high = (format_value(key, band[end]) for end in ("low", "high"))
+        cause = f"{number_name(band['cause'])} {100 * band['cause_fraction']:.0f}\u202f%" if "cause" in band else ""
+        found.append(Row(Quantity((key,), 0.0).name, format_value(key, implant.get(key)), low, high, cause))
+    return found
+
+
+def ends(implant: Mapping[str, Any], key: str) -> str:
+    """Return the band of one metric of an implant in brackets, such as ``(14.7 to 19.1 mm)``; empty without a width."""
+    band = implant.get("bands", {}).get("results", {}).get(key)
+    if band is None:
+        return ""
+    low, high = (format_value(key, band[end]) for end in ("low", "high"))
+    number, _, unit = low.partition("\u202f")
+    return "" if low == high else f"({number if unit else low} to {high})"
+
+
+def how_sure(implant: Mapping[str, Any], title: str = "", *, is_told: bool = False) -> str:
+    """Return the sentences on how sure a device is; empty where the metrics of the implant do not state it.
+
+    Where several implants are of one device, `title` tells them apart, and the sentence on the numbers of the device
+    is left out once it is told.
+    """
+    bands = implant.get("bands", {})
+    if not bands:
+        return ""
+    ranges = []
+    for key in HEADLINES:
+        if band := ends(implant, key):
+            cause = bands["results"][key].get("cause")
+            because = f" (mostly the {number_name(cause)})" if cause else ""
+            ranges.append(f"{Quantity((key,), 0.0).name.lower()} {band[1:-1]}{because}")
+    sentences = [] if is_told else [bands["device"]]
+    if ranges:
+        whose = "its" if is_told else "these"
+        sentences.append(f"Within the ranges of {whose} numbers{f' ({title})' if title else ''}: {'; '.join(ranges)}.")
+    sizes = bands.get("proposed_sizes", "")
+    if " to " in sizes:
+        sentences.append(f"The proposed size varies from {sizes}.")
+    return " ".join(sentences)
 
 
 class Interval(NamedTuple):
@@ -44,41 +124,30 @@ class Varied(NamedTuple):
 
 def intervals(treatment: Mapping[str, Any]) -> list[Interval]:
     """Return the uncertainty of every result in the metrics of a treatment; empty without an uncertainty study."""
-    varied = treatment.get("uncertainty", {})
-    return [_interval(key, ends, varied["shares"][key]) for key, ends in varied.get("intervals", {}).items()]
-
-
-def _interval(key: str, ends: Mapping[str, float], shares: Mapping[str, float]) -> Interval:
-    """Return the uncertainty of one result as text."""
-    names = [(cause.removesuffix("_fraction"), share) for cause, share in shares.items()]
-    parts = [(CAUSES.get(cause) or number_name(cause), share) for cause, share in names]
-    parts.sort(key=lambda part: -part[1])
-    mean, low, high = (format_value(key, ends[end]) for end in ("mean", "low", "high"))
-    return Interval(Quantity((key,), 0.0).name, mean, low, high, parts)
-
-
-def uncertainty_of(metrics: Mapping[str, Any], titles: Mapping[str, str]) -> list[Varied]:
-    """Return the uncertainty of all treatments; empty without an uncertainty study.
-
-    Parameters
-    ----------
-    metrics : metrics of the case.
-    titles : titles of the treatments by name.
-    """
-    found = []
-    for name, treatment in metrics.get("treatments", {}).items():
-        if "uncertainty" in treatment:
-            found.append(Varied(titles.get(name, name), _words(treatment["uncertainty"]), intervals(treatment)))
+    varied, found = treatment.get("uncertainty", {}), []
+    for key, interval in varied.get("intervals", {}).items():
+        names = [(cause.removesuffix("_fraction"), share) for cause, share in varied["shares"][key].items()]
+        shares = [(CAUSES.get(cause) or number_name(cause), share) for cause, share in names]
+        mean, low, high = (format_value(key, interval[end]) for end in ("mean", "low", "high"))
+        found.append(Interval(Quantity((key,), 0.0).name, mean, low, high, sorted(shares, key=lambda part: -part[1])))
     return found
 
 
-def _words(varied: Mapping[str, Any]) -> str:
-    """Return the number of deployments and the ranges that were varied, as text."""
-    ranges = varied["ranges"]
-    told = [
-        f"{CAUSES[key.rsplit('_', 1)[0]]} ±{format_value(key, value)}" for key, value in ranges.items() if value > 0
-    ]
-    if varied.get("numbers"):
-        told.append("the numbers of the device within their ranges in the catalogue")
-    failed = f", of which {varied['failed_count']} did not fit the artery" if varied["failed_count"] else ""
-    return f"{varied['samples_count']} deployments{failed}. Varied: {', '.join(told)}."
+def uncertainty_of(metrics: Mapping[str, Any], titles: Mapping[str, str]) -> list[Varied]:
+    """Return the uncertainty of all treatments, under their titles by name; empty without an uncertainty study."""
+    found = []
+    for name, treatment in metrics.get("treatments", {}).items():
+        if "uncertainty" not in treatment:
+            continue
+        study = treatment["uncertainty"]
+        ranges = [
+            f"{CAUSES[key.rsplit('_', 1)[0]]} ±{format_value(key, value)}"
+            for key, value in study["ranges"].items()
+            if value > 0
+        ]
+        if study.get("numbers"):
+            ranges.append("the numbers of the device within their ranges in the catalogue")
+        failed = f", of which {study['failed_count']} did not fit the artery" if study["failed_count"] else ""
+        words = f"{study['samples_count']} deployments{failed}. Varied: {', '.join(ranges)}."
+        found.append(Varied(titles.get(name, name), words, intervals(treatment)))
+    return found

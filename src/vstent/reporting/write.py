@@ -1,6 +1,7 @@
 """Write the report of a case as HTML, and optionally as PDF."""
 
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -8,7 +9,7 @@ from vstent.io.files import atomic
 from vstent.io.writers import write_text
 from vstent.reporting.drawing import Drawing
 from vstent.reporting.films import KeptFilms, kept_films
-from vstent.reporting.page import as_html, contents_of, with_films
+from vstent.reporting.page import as_html, contents_of
 from vstent.reporting.pdf import as_pdf
 from vstent.reporting.plan_sheet import Planned, plan_pdf
 from vstent.study.folder import CACHE
@@ -24,14 +25,7 @@ ASSETS: Final = Path(__file__).with_name("assets")
 
 
 def write_plan(case: "CaseResult", out: Path, day: str) -> None:
-    """Write ``plan.pdf`` into a case folder: one page per implant, without the flow.
-
-    Parameters
-    ----------
-    case : the finished case.
-    out : its case folder.
-    day : date of the plan, ISO 8601.
-    """
+    """Write ``plan.pdf`` of a finished case, dated in ISO 8601, into its folder: one page per implant, no flow."""
     metrics = {name: case.metrics["treatments"][name]["implants"] for name in case.implants}
     planned = Planned(case.name, case.anatomy, case.implants, metrics, case.provenance["input"]["sha256"], day)
     with atomic(out / "plan.pdf") as partial:
@@ -49,11 +43,11 @@ def write_report(case: "CaseResult", out: Path, *, is_printed: bool = False, dra
     drawing : the pictures of the case, if they are being drawn already.
     """
     films = kept_films(out)
-    told = {name: value for name, value in case.provenance.items() if name != SECONDS}
+    provenance = {name: value for name, value in case.provenance.items() if name != SECONDS}
     shown = [] if films is None else [*(one.image.tobytes() for one in films.pictures), films.animation]
     files = [*shown, *(file.read_bytes() for file in sorted(ASSETS.iterdir()))]
     digests = [hashlib.sha256(one).hexdigest() for one in files]
-    key = key_of(f"{__name__}:_write", list(case.keys.values()), case.metrics, case.notes, told, digests)
+    key = key_of(f"{__name__}:_write", list(case.keys.values()), case.metrics, case.notes, provenance, digests)
     names = ["report.html"] + ["report.pdf"] * is_printed
     Store(out / CACHE).write_once("report", key, out, names, lambda: _write(case, out, names, drawing, films))
 
@@ -61,7 +55,8 @@ def write_report(case: "CaseResult", out: Path, *, is_printed: bool = False, dra
 def _write(case: "CaseResult", out: Path, names: list[str], drawing: Drawing | None, films: KeptFilms | None) -> str:
     """Write the report in the files named; return a sentence."""
     told = contents_of(case, drawing)
-    told = told if films is None else with_films(told, films)
+    if films is not None:
+        told = replace(told, pictures=(*told.pictures, *films.pictures), film=films.animation)
     write_text(out / "report.html", as_html(told))
     if "report.pdf" in names:
         with atomic(out / "report.pdf") as partial:

@@ -14,11 +14,11 @@ import vstent
 from vstent import phantoms
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
-from vstent.app.cases import Store
+from vstent.app.cases import Cases
 from vstent.app.choices import FlowChoice
-from vstent.app.desk import Desk
 from vstent.app.jobs import Jobs
-from vstent.app.preview import Preview, Shelf, _Worker, shelf_of
+from vstent.app.live import BareFlowStore, LiveFlowProcess, _Worker
+from vstent.app.workspace import Workspace
 from vstent.devices.stent import Stent
 from vstent.errors import InputError
 from vstent.flow.settings import FlowSettings, Numerics
@@ -37,19 +37,19 @@ def anatomy() -> Anatomy:
 
 @pytest.fixture(scope="module")
 def preview(anatomy: Anatomy):
-    found = Preview(anatomy, FlowSettings(inflow_mL_s=1.5, numerics=Numerics(cells_per_diameter=13.0)))
+    found = LiveFlowProcess(anatomy, FlowSettings(inflow_mL_s=1.5, numerics=Numerics(cells_per_diameter=13.0)))
     yield found
     found.stop()
 
 
-def manifest(preview: Preview) -> dict:
+def manifest(preview: LiveFlowProcess) -> dict:
     """Return the manifest of a message."""
     raw = preview.message()
     length = int.from_bytes(raw[:4], "little")
     return json.loads(raw[4 : 4 + length])
 
 
-def until(preview: Preview, holds) -> dict:
+def until(preview: LiveFlowProcess, holds) -> dict:
     """Ask until something holds of the answer."""
     began = time.monotonic()
     while time.monotonic() - began < LONGEST_S:
@@ -61,14 +61,14 @@ def until(preview: Preview, holds) -> dict:
     raise AssertionError(told)
 
 
-def test_without_a_device_nothing_changes(preview: Preview) -> None:
+def test_without_a_device_nothing_changes(preview: LiveFlowProcess) -> None:
     told = until(preview, lambda told: told["is_settled"] and told["layers"])
     assert abs(told["reductions"]["neck_inflow_mL_s"]) < 4.0
     (layer,) = told["layers"]
     assert (layer["id"], layer["pane"]) == ("streamlines", "")
 
 
-def test_a_device_lowers_the_inflow_and_old_values_are_marked(preview: Preview, anatomy: Anatomy) -> None:
+def test_a_device_lowers_the_inflow_and_old_values_are_marked(preview: LiveFlowProcess, anatomy: Anatomy) -> None:
     preview.place((vstent.deploy(vstent.find_design("silk"), anatomy).stent,))
     assert manifest(preview)["is_stale"]
     told = until(preview, lambda told: not told["is_stale"] and told["is_settled"])
@@ -76,7 +76,7 @@ def test_a_device_lowers_the_inflow_and_old_values_are_marked(preview: Preview, 
     assert told["history"][-1] == pytest.approx(told["reductions"]["neck_inflow_mL_s"], abs=2.0)
 
 
-def test_whoever_draws_a_device_does_not_wait_for_the_flow(preview: Preview, anatomy: Anatomy) -> None:
+def test_whoever_draws_a_device_does_not_wait_for_the_flow(preview: LiveFlowProcess, anatomy: Anatomy) -> None:
     """Devices are larger than the buffer of the pipe; while the process does not read, only the newest is kept."""
     stent = vstent.deploy(vstent.find_design("silk"), anatomy).stent
     os.kill(preview._process.pid, signal.SIGSTOP)
@@ -93,7 +93,7 @@ def test_whoever_draws_a_device_does_not_wait_for_the_flow(preview: Preview, ana
     assert time.monotonic() - began < 30.0  # two devices at most are placed, not twenty
 
 
-def test_streamlines_that_the_page_has_are_not_sent_again(preview: Preview) -> None:
+def test_streamlines_that_the_page_has_are_not_sent_again(preview: LiveFlowProcess) -> None:
     preview.place(preview._stents)
     os.kill(preview._process.pid, signal.SIGSTOP)
     try:
@@ -105,7 +105,7 @@ def test_streamlines_that_the_page_has_are_not_sent_again(preview: Preview) -> N
         os.kill(preview._process.pid, signal.SIGCONT)
 
 
-def test_killed_it_begins_again_with_the_same_device(preview: Preview) -> None:
+def test_killed_it_begins_again_with_the_same_device(preview: LiveFlowProcess) -> None:
     before = manifest(preview)["reductions"]["neck_inflow_mL_s"]
     os.kill(preview._process.pid, signal.SIGKILL)
     preview._process.join(10)
@@ -113,7 +113,7 @@ def test_killed_it_begins_again_with_the_same_device(preview: Preview) -> None:
     assert told["reductions"]["neck_inflow_mL_s"] == pytest.approx(before, abs=4.0)
 
 
-def is_at_rest(preview: Preview) -> bool:
+def is_at_rest(preview: LiveFlowProcess) -> bool:
     """Return whether the process uses less than a fifth of a core."""
     path = f"/proc/{preview._process.pid}/stat"
     if not os.path.exists(path):
@@ -128,7 +128,7 @@ def is_at_rest(preview: Preview) -> bool:
     return ticks() - first < 20  # of 100 a second and core
 
 
-def test_unwatched_it_rests(preview: Preview) -> None:
+def test_unwatched_it_rests(preview: LiveFlowProcess) -> None:
     until(preview, lambda told: told["is_settled"])
     time.sleep(3.0)
     assert is_at_rest(preview)
@@ -145,18 +145,18 @@ def in_time(holds) -> bool:
 
 def test_what_is_prepared_is_stored_and_continued(anatomy: Anatomy, tmp_path: Path) -> None:
     settings = FlowSettings(inflow_mL_s=1.5, numerics=Numerics(cells_per_diameter=13.0))
-    shelf, bare = shelf_of(tmp_path, "anatomy", settings), []
+    store, bare = BareFlowStore.of(tmp_path, "anatomy", settings), []
     stent = vstent.deploy(vstent.find_design("silk"), anatomy).stent
     for damage in (None, None, slice(0, 1000)):
         (kept,) = [*tmp_path.glob("live-*.npz")] or [tmp_path / "none"]
         if damage is not None:
             kept.write_bytes(kept.read_bytes()[damage])
         written = kept.stat().st_mtime_ns if kept.exists() else 0
-        preview = Preview(anatomy, settings, shelf)
+        preview = LiveFlowProcess(anatomy, settings, store)
         try:
             assert in_time(lambda preview=preview: not preview.is_preparing)
             assert damage or written or is_at_rest(preview)
-            assert preview._said.values == {}
+            assert preview._reading.values == {}
             (kept,) = tmp_path.glob("live-*.npz")
             assert (kept.stat().st_mtime_ns == written) is (damage is None and written > 0)
             preview.place((stent,))
@@ -171,9 +171,10 @@ def test_what_is_prepared_is_stored_and_continued(anatomy: Anatomy, tmp_path: Pa
 
 
 def test_a_process_that_nobody_asks_ends(anatomy: Anatomy, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vstent.app.preview.IDLE_S", 0.1)
-    flow, kept = SimpleNamespace(is_prepared=True), []
-    store = SimpleNamespace(begin=lambda *_: flow, keep=kept.append)
+    monkeypatch.setattr("vstent.app.live.IDLE_S", 0.1)
+    flow, kept = SimpleNamespace(is_prepared=False), []
+    flow.prepare = lambda _: setattr(flow, "is_prepared", True)
+    store = SimpleNamespace(load=lambda *_: flow, save=kept.append)
     ours, theirs = Pipe()
     _Worker(theirs, anatomy, FlowSettings(), store).run()
     assert kept == [flow]
@@ -183,14 +184,14 @@ def test_a_process_that_nobody_asks_ends(anatomy: Anatomy, monkeypatch: pytest.M
 def test_a_vessel_without_a_sac_has_none() -> None:
     healthy = restore(trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=30.0), edge_mm=0.4))))
     with pytest.raises(InputError, match="needs a sac"):
-        Preview(healthy, FlowSettings())
+        LiveFlowProcess(healthy, FlowSettings())
 
 
 class Idle:
     """A live flow without a process."""
 
-    def __init__(self, anatomy: Anatomy, settings: FlowSettings, shelf: Shelf) -> None:
-        self.shelf, self.is_watched, self.is_preparing, self.is_stopped = shelf, False, True, False
+    def __init__(self, anatomy: Anatomy, settings: FlowSettings, store: BareFlowStore) -> None:
+        self.store, self.is_watched, self.is_preparing, self.is_stopped = store, False, True, False
 
     def place(self, stents: tuple[Stent, ...]) -> None:
         """Do nothing."""
@@ -200,54 +201,54 @@ class Idle:
 
 
 @pytest.fixture
-def desk(anatomy: Anatomy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Desk:
+def workspace(anatomy: Anatomy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Workspace:
     """Two cases with an anatomy, and live flows without a process."""
-    desk = Desk(Store(tmp_path))
+    workspace = Workspace(Cases(tmp_path))
     for name in ("one", "two"):
-        case = desk.store.create(name, anatomy="of " + name, input="scan")
+        case = workspace.cases.create(name, anatomy="of " + name, input="scan")
         (case.folder / "scan").touch()
         save_data(case.folder / CACHE / f"anatomy-of {name}.npz", anatomy)
-    monkeypatch.setattr("vstent.app.preview.Preview", Idle)
+    monkeypatch.setattr("vstent.app.live.LiveFlowProcess", Idle)
     monkeypatch.setattr(Jobs, "start", lambda *_: None)
-    return desk
+    return workspace
 
 
-def test_a_job_ends_what_is_prepared_and_nothing_else(desk: Desk) -> None:
-    one = desk.store.get("one")
+def test_a_job_ends_what_is_prepared_and_nothing_else(workspace: Workspace) -> None:
+    one = workspace.cases.get("one")
     for is_watched, is_preparing in ((True, False), (False, False), (False, True)):
-        assert desk.prepare_preview(one)
-        preview = desk.preview(one)
+        assert workspace.prepare_live_flow(one)
+        preview = workspace.live_flow(one)
         preview.is_watched, preview.is_preparing = is_watched, is_preparing
-        desk.start(one, "anatomy")
+        workspace.start(one, "anatomy")
         assert preview.is_stopped is is_preparing
         preview.is_watched = False
-    desk.jobs._jobs["two"] = SimpleNamespace(is_alive=True)
-    assert not desk.prepare_preview(one)
-    assert desk._previews == {}
+    workspace.jobs._jobs["two"] = SimpleNamespace(is_alive=True)
+    assert not workspace.prepare_live_flow(one)
+    assert workspace._live_flows == {}
 
 
 def test_nothing_is_prepared_beside_a_watched_flow_or_without_memory(
-    desk: Desk, monkeypatch: pytest.MonkeyPatch
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    one, two = (desk.store.get(name) for name in ("one", "two"))
-    watched = desk.preview(one)
+    one, two = (workspace.cases.get(name) for name in ("one", "two"))
+    watched = workspace.live_flow(one)
     watched.is_watched = True
-    assert not desk.prepare_preview(two)
+    assert not workspace.prepare_live_flow(two)
     watched.is_watched = False
     monkeypatch.setattr("vstent.flow.memory.free_memory_bytes", lambda: 1e9)
-    assert not desk.prepare_preview(two)
+    assert not workspace.prepare_live_flow(two)
     monkeypatch.undo()
-    monkeypatch.setattr("vstent.app.preview.Preview", Idle)
-    assert desk.prepare_preview(two)
+    monkeypatch.setattr("vstent.app.live.LiveFlowProcess", Idle)
+    assert workspace.prepare_live_flow(two)
     assert watched.is_stopped
 
 
-def test_a_pulse_keeps_what_is_prepared_and_another_inflow_does_not(desk: Desk) -> None:
-    one = desk.store.get("one")
-    first = desk.preview(one)
+def test_a_pulse_keeps_what_is_prepared_and_another_inflow_does_not(workspace: Workspace) -> None:
+    one = workspace.cases.get("one")
+    first = workspace.live_flow(one)
     for number, (flow, is_same) in enumerate(
         ((FlowChoice(is_pulsatile=True), True), (FlowChoice(inflow_mL_s=2), False))
     ):
         one.change(number, one.state.choices.model_copy(update={"flow": flow}))
-        assert (desk.preview(one) is first) is is_same
+        assert (workspace.live_flow(one) is first) is is_same
     assert first.is_stopped

@@ -6,37 +6,32 @@ import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from vstent.app import intake
-from vstent.app.cases import STATE, STEPS, Absent, Case, Conflict, Store, dependencies, failures, statuses
+from vstent.app.cases import STATE, STEPS, Case, Cases, dependencies, failures, statuses
 from vstent.app.choices import Point, pulse_of
-from vstent.app.finished import REPORT, RUN, kept_flows, kept_histories, lost_steps
+from vstent.app.finished import REPORT, RUN, kept_flows, kept_histories, lost_steps, reopened, stem
 from vstent.app.jobs import KINDS, RANKING, Jobs
-from vstent.app.reopening import reopened, stem
 from vstent.devices.treatment import BARE, Treatment
 from vstent.errors import InputError, ReadError
 from vstent.io.files import atomic, existing
 
 PICTURE: Final = ".picture.png"
 """File of a case folder with its picture in the list of cases."""
+INPUT_FACES: Final = 40_000
+"""Number of triangles above which the surface of an input is decimated for the page."""
 
 
-class Desk:
-    """Cases, jobs and immediate answers.
+class Workspace:
+    """Cases, jobs and immediate answers; `opened` names the case that the page opens first, empty: the list."""
 
-    Parameters
-    ----------
-    store : cases of the workspace.
-    opened : name of the case that the page opens first; empty: the list of cases.
-    """
-
-    def __init__(self, store: Store, *, opened: str = "") -> None:
-        self.store, self.opened = store, opened
+    def __init__(self, cases: Cases) -> None:
+        self.cases, self.opened = cases, ""
         self.jobs = Jobs()
         self.is_closing = False
-        self._lives: dict[str, Any] = {}
         self._previews: dict[str, Any] = {}
+        self._live_flows: dict[str, Any] = {}
         self._scans: dict[str, Any] = {}
         self._lock = threading.Lock()
         self._loading = threading.Lock()
@@ -54,11 +49,11 @@ class Desk:
         """
         existing(path)
         if (path / STATE).is_file():
-            self.opened = self.store.adopt(path).id
+            self.opened = self.cases.adopt(path).id
         elif (path / RUN).is_file():
-            self.opened = reopened(self.store, path).id
+            self.opened = reopened(self.cases, path).id
         else:
-            case = self.store.of_input(path) or self.store.create(stem(path))
+            case = self.cases.of_input(path) or self.cases.create(stem(path))
             self.opened = case.id
             if not case.state.source:
                 self._to_begin = (case, path)
@@ -66,25 +61,22 @@ class Desk:
     def listed(self) -> list[dict[str, Any]]:
         """Return every case with its title and progress."""
         found = []
-        for case_id in self.store.ids():
+        for case_id in self.cases.ids():
             try:
-                case = self.store.get(case_id)
+                case = self.cases.get(case_id)
                 lost = lost_steps(case.folder, case.state)
                 changed_s = (case.folder / STATE).stat().st_mtime
             except (ReadError, OSError):
                 continue  # a folder of something else, a damaged one, or one that is being deleted
             steps = statuses(case.state, "", lost)
-            done = [step for step in STEPS if steps[step] == "done"]
-            kept = [step for step in STEPS if step in case.state.done and step not in lost]
-            has_picture = (case.folder / PICTURE).is_file()
             found.append(
                 {
                     "id": case_id,
                     "name": case.state.name,
-                    "done": done,
-                    "kept": kept,
+                    "done": [step for step in STEPS if steps[step] == "done"],
+                    "kept": [step for step in STEPS if step in case.state.done and step not in lost],
                     "changed_s": changed_s,
-                    "has_picture": has_picture,
+                    "has_picture": (case.folder / PICTURE).is_file(),
                 }
             )
         return found
@@ -92,17 +84,15 @@ class Desk:
     def remove(self, case: Case) -> None:
         """Stop everything that works on a case, and delete it with its folder."""
         self.jobs.stop(case)
-        self.end_preview(case)
-        self.store.remove(case)
+        self.end_live_flow(case)
+        self.cases.remove(case)
         with self._lock:
-            self._lives.pop(case.id, None)
+            self._previews.pop(case.id, None)
             self._scans.pop(case.id, None)
 
     def view(self, case: Case) -> dict[str, Any]:
         """Return the state of a case as clients read it."""
-        state, job = case.state, self.jobs.of(case)
-        is_at_work = job is not None and job.is_alive
-        at_work = job.step if job is not None and is_at_work else ""
+        state, job = case.state, self.jobs.running(case)
         return {
             "id": case.id,
             "name": state.name,
@@ -110,7 +100,7 @@ class Desk:
             "revision": state.revision,
             "choices": state.choices.model_dump(mode="json"),
             "unseen": state.unseen() if state.former else [],
-            "steps": statuses(state, at_work, lost_steps(case.folder, state)),
+            "steps": statuses(state, job.step if job else "", lost_steps(case.folder, state)),
             "failed": failures(state),
             "can_undo": bool(state.undo),
             "can_redo": bool(state.redo),
@@ -124,14 +114,14 @@ class Desk:
             "has_ranking": (case.folder / RANKING).is_file(),
             "has_flow": bool(kept_flows(case.folder)),
             "has_angiogram": bool(kept_histories(case.folder)),
-            "job": job.told() if job is not None and is_at_work else None,
+            "job": job.told() if job else None,
         }
 
     def demo(self) -> Case:
         """Create a case of the synthetic scan."""
         from vstent.study.demo import write_scan
 
-        case = self.store.create("demo")
+        case = self.cases.create("demo")
         write_scan(case.folder / intake.FOLDER / intake.SERIES)
         self.begin(case)
         return case
@@ -165,15 +155,17 @@ class Desk:
             raise ReadError(f"The scan of {case.state.name} has been moved from {case.input}. Put it back there.")
         if kind != "anatomy" and not case.state.choices.treatments:
             raise InputError("No device is chosen. Choose one in the step Device.")
-        if kind == "angiogram" and not _has_flow(case):
+        steps = statuses(case.state, "", lost_steps(case.folder, case.state))
+        if kind == "angiogram" and not (case.state.choices.flow.is_wanted and steps["flow"] == "done"):
             raise InputError("The flow is out of date or not computed, and contrast moves with it. Run the step Flow.")
-        self._yield_to_job()
+        with self._lock:  # the job has the cores of the live flows that compute although nobody watches
+            for case_id in [name for name, one in self._live_flows.items() if one.is_preparing]:
+                self._live_flows.pop(case_id).stop()
         self.jobs.start(case, kind)
 
     def resume(self, case: Case) -> None:
         """Resume the job that was running when the server was killed."""
-        job = self.jobs.of(case)
-        if case.state.job in KINDS and job is None and case.state.source:
+        if case.state.job in KINDS and not self.jobs.has(case) and case.state.source:
             self.start(case, case.state.job)
 
     def note_deployed(self, case: Case, treatment: Treatment) -> None:
@@ -186,16 +178,16 @@ class Desk:
 
     # -- immediate answers ---------------------------------------------------------------------------------------------
 
-    def live(self, case: Case) -> Any:
+    def preview(self, case: Case) -> Any:
         """Return the object that answers immediately for a case."""
-        from vstent.app.live import Live
+        from vstent.app.preview import Preview
 
         with self._lock:
-            if case.id not in self._lives:
-                self._lives[case.id] = Live(case)
-            return self._lives[case.id]
+            if case.id not in self._previews:
+                self._previews[case.id] = Preview(case)
+            return self._previews[case.id]
 
-    def preview(self, case: Case) -> Any:
+    def live_flow(self, case: Case) -> Any:
         """Return the live flow of a case; start it where it does not run, or runs for another anatomy or flow.
 
         Raises
@@ -203,24 +195,24 @@ class Desk:
         InputError
             The vessel has no sac.
         """
-        from vstent.app.preview import Preview, shelf_of
+        from vstent.app.live import BareFlowStore, LiveFlowProcess
         from vstent.flow.settings import FlowSettings
         from vstent.study.folder import CACHE
 
-        live, state = self.live(case), case.state
+        preview, state = self.preview(case), case.state
         given = state.settings().flow or FlowSettings()
         settings = replace(given, waveform=None, numerics=replace(given.numerics, close_up=False))
-        shelf = shelf_of(case.folder / CACHE, state.anatomy, settings)
+        store = BareFlowStore.of(case.folder / CACHE, state.anatomy, settings)
         with self._lock:
-            found = self._previews.get(case.id)
-            if found is None or found.shelf != shelf:
-                for one in self._previews.values():
+            found = self._live_flows.get(case.id)
+            if found is None or found.store != store:
+                for one in self._live_flows.values():
                     one.stop()  # one at a time: each uses all cores
-                self._previews = {case.id: Preview(live.anatomy, settings, shelf)}
-                live.follow(self._previews[case.id].place)
-            return self._previews[case.id]
+                self._live_flows = {case.id: LiveFlowProcess(preview.anatomy, settings, store)}
+                preview.follow(self._live_flows[case.id].place)
+            return self._live_flows[case.id]
 
-    def prepare_preview(self, case: Case) -> bool:
+    def prepare_live_flow(self, case: Case) -> bool:
         """Begin to compute the live flow without a device, so that numbers follow soon when it is switched on.
 
         Raises
@@ -228,27 +220,21 @@ class Desk:
         InputError
             The vessel has no sac.
         """
-        from vstent.app.preview import FREE_BYTES
+        from vstent.app.live import FREE_BYTES
         from vstent.flow.memory import free_memory_bytes
 
-        is_in_use = any(one.is_watched for one in tuple(self._previews.values()))
+        is_in_use = any(one.is_watched for one in tuple(self._live_flows.values()))
         if is_in_use or self.jobs.are_running or free_memory_bytes() < FREE_BYTES:
             return False
-        self.preview(case)
+        self.live_flow(case)
         return True
 
-    def _yield_to_job(self) -> None:
-        """End the live flows that compute although nobody watches."""
-        with self._lock:
-            for case_id in [name for name, one in self._previews.items() if one.is_preparing]:
-                self._previews.pop(case_id).stop()
-
-    def end_preview(self, case: Case) -> None:
+    def end_live_flow(self, case: Case) -> None:
         """Stop the live flow of a case."""
         with self._lock:
-            found = self._previews.pop(case.id, None)
-            if case.id in self._lives:
-                self._lives[case.id].follow(None)
+            found = self._live_flows.pop(case.id, None)
+            if case.id in self._previews:
+                self._previews[case.id].follow(None)
         if found is not None:
             found.stop()
 
@@ -282,9 +268,9 @@ class Desk:
         """Return the outlines on a slice as a message for the page."""
         from vstent.app.outlines import outlines
 
-        live = self.live(case)
-        stents = [] if treatment is None else live.stents(live.choice(treatment))
-        return outlines(self.scan(case).grid(is_upright=is_upright), live.anatomy, stents, axis, index)
+        preview = self.preview(case)
+        stents = [] if treatment is None else preview.stents(preview.choice(treatment))
+        return outlines(self.scan(case).grid(is_upright=is_upright), preview.anatomy, stents, axis, index)
 
     def input_surface(self, case: Case) -> bytes:
         """Return the surface of the input as read, as a message for the page.
@@ -294,34 +280,32 @@ class Desk:
         InputError
             The case has a scan, or the surface cannot be read.
         """
-        from vstent.app.intake_view import read_layer
+        from vstent.io.surfaces import read_surface
+        from vstent.reporting.packing import message
+        from vstent.reporting.scene import FRONTAL, WALL_COLOUR, MeshLayer, view_of
+        from vstent.reporting.thinning import thin_surface
 
         if not _is_surface(case):
             raise InputError("This case has a scan and not a surface.")
-        return read_layer(case.input, case.state.choices)
+        choices = case.state.choices
+        surface, _ = thin_surface(read_surface(case.input, units=choices.units, frame=choices.frame)[0], INPUT_FACES)
+        layer = MeshLayer("input", "", WALL_COLOUR, surface)
+        return message([layer], views=[view_of("whole", FRONTAL, surface.vertices_mm)])
 
     def surface(self, case: Case, threshold: float) -> bytes:
         """Return the surface of the scan at a threshold, as a message for the page."""
-        from vstent.app.live import LOCK
+        from vstent.app.preview import LOCK
 
         scan = self.scan(case)
         with LOCK:
             return bytes(scan.surface(threshold))
 
     def neck(self, case: Case, curve_mm: Sequence[Point], handle: int | None, to_mm: Point | None) -> bytes:
-        """Return a neck as a message for the page.
-
-        Parameters
-        ----------
-        case : the case.
-        curve_mm : points of the neck in LPS mm.
-        handle : number of a handle to move; None: none.
-        to_mm : new position of the handle.
-        """
+        """Return a neck through points in LPS mm, with a handle of it moved to a point, as a message for the page."""
         import numpy as np
 
-        whither = None if to_mm is None else np.array(to_mm, dtype=np.float64)
-        return bytes(self.live(case).neck_message(np.array(curve_mm, dtype=np.float64), handle, whither))
+        target_mm = None if to_mm is None else np.array(to_mm, dtype=np.float64)
+        return bytes(self.preview(case).neck_message(np.array(curve_mm, dtype=np.float64), handle, target_mm))
 
     def numbers(self, case: Case) -> dict[str, Any]:
         """Return all results so far: anatomy, flow without and with devices, and uncertainty."""
@@ -329,7 +313,7 @@ class Desk:
 
         found: dict[str, Any] = {"anatomy": [], "flow": [], "uncertainty": []}
         if case.state.anatomy:
-            found["anatomy"] = self.live(case).anatomy_sheet()
+            found["anatomy"] = self.preview(case).anatomy_sheet()
         path = case.folder / "metrics.json"
         if path.is_file():
             metrics = json.loads(path.read_text(encoding="utf-8"))
@@ -352,25 +336,16 @@ class Desk:
         Two threads that import a package and one of its modules at the same time may get incomplete modules.
         """
         with self._loading:
-            from vstent.app import intake_view, live, outlines, scans, sheets  # noqa: F401
+            from vstent.app import outlines, preview, scans, sheets  # noqa: F401
             from vstent.devices import schema as device_schema  # noqa: F401
             from vstent.flow import waveform  # noqa: F401
 
     def close(self) -> None:
         """Stop all jobs, which are resumed later, and the live flow."""
         self.is_closing = True
-        for one in self._previews.values():
+        for one in self._live_flows.values():
             one.stop()
         self.jobs.abandon()
-
-
-def code_of(error: Exception) -> int:
-    """Return the HTTP status of an error."""
-    if isinstance(error, Conflict):
-        return 409
-    if isinstance(error, Absent):
-        return 404
-    return 422 if isinstance(error, InputError) else 500
 
 
 def keep_picture(case: Case, data: bytes) -> None:
@@ -405,11 +380,6 @@ def begin_upload(case: Case, name: str) -> Path:
     return Path(handle.name)
 
 
-def end_upload(case: Case, partial: Path, name: str) -> None:
-    """Accept a complete upload."""
-    intake.take(partial, name, case.folder)
-
-
 def devices() -> list[dict[str, Any]]:
     """Return the catalogue as the page lists it."""
     from vstent.devices.catalogue import catalogue
@@ -426,13 +396,6 @@ def devices() -> list[dict[str, Any]]:
         }
         for key, design in catalogue().items()
     ]
-
-
-def landing(abscissa_mm: float | None, anchor: Literal["proximal", "center", "distal"]) -> Any:
-    """Return the landing of a device at a position along the parent axis; None where no position is given."""
-    from vstent.devices.stent import Landing
-
-    return None if abscissa_mm is None else Landing(abscissa_mm, anchor)
 
 
 def ranking(case: Case) -> dict[str, Any]:
@@ -482,9 +445,3 @@ def _wants_grid(case: Case) -> bool:
 
     choices = case.state.choices
     return suffix(case.input) in RAW_SUFFIXES and (choices.shape is None or choices.spacing_mm is None)
-
-
-def _has_flow(case: Case) -> bool:
-    """Return whether the flows of a case are computed and up to date; a study without flow has none."""
-    steps = statuses(case.state, "", lost_steps(case.folder, case.state))
-    return case.state.choices.flow.is_wanted and steps["flow"] == "done"
