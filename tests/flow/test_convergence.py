@@ -8,8 +8,7 @@ import pytest
 
 from vstent import phantoms
 from vstent.cli import main
-from vstent.flow.convergence import RATIO, SAFETY, observed
-from vstent.flow.positions import Scatter, scatter
+from vstent.flow.convergence import RATIO, SAFETY, Scatter, observed, scatter
 from vstent.io.writers import write_stl
 
 

@@ -9,19 +9,20 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from vstent.anatomy.landing_zones import neck_span_mm
-from vstent.angiography import washout as washouts
 from vstent.angiography.bolus import Bolus, OverTime
 from vstent.angiography.curves import Curves
 from vstent.angiography.grid import Grid, grid_of
 from vstent.angiography.network import Network, period_s
 from vstent.angiography.transport import Frame, Transport
+from vstent.angiography.washout import MOMENTS_S, STAYED, Washout, wash_out
 from vstent.errors import FlowError, InputError
 from vstent.flow.case import FlowCase, FlowField
-from vstent.flow.indices import on_sac
+from vstent.flow.indices import on_sac, vertex_areas_mm2
 from vstent.flow.memory import free_memory_bytes
 from vstent.flow.problem import flow_case
+from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy
-from vstent.kernels.arrays import Bools, Floats, Ints, freeze
+from vstent.kernels.arrays import Bools, Floats, Ints
 
 BYTES_PER_CELL: Final = 1200
 """Peak memory per cell of the flow, in bytes."""
@@ -73,18 +74,10 @@ class Angiogram:
 
     curves: Curves
     """Time-density curves."""
-    washout_time_s: Floats
-    """(w,) times of the washout of the sac; empty without a sac."""
-    washout_fraction: Floats
-    """(w,) part of the sac's blood that is still in it."""
     measures: dict[str, float]
     """Times, volumes and areas; the end of each key is its unit."""
     advice: str
     """Sentences on the grid and on what the window did not reach."""
-
-    def __post_init__(self) -> None:
-        freeze(self, "washout_time_s", np.float64, (-1,))
-        freeze(self, "washout_fraction", np.float64, (len(self.washout_time_s),))
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,16 +90,6 @@ class Injection:
     """The concentration."""
     settings: AngiogramSettings
     """Settings."""
-
-    @property
-    def points_mm(self) -> Floats:
-        """Cell centers (n, 3), LPS."""
-        return self.grid.network.points_mm
-
-    @property
-    def spacing_mm(self) -> Floats:
-        """Edge (n,) of a cube with the volume of each cell."""
-        return self.grid.network.edge_mm
 
     def frames(self) -> Iterator[Frame]:
         """March once, and yield time in s since the start of the waveform and iodine in mg/mL (n,) of every frame."""
@@ -125,12 +108,7 @@ def memory_bytes(field: FlowField) -> float:
 
 
 def entering(bolus: Bolus, field: FlowField) -> tuple[OverTime, float]:
-    """Return the iodine concentration in mg/mL of the blood that enters a flow, over time in s, and its maximum.
-
-    Parameters
-    ----------
-    field : the flow, steady or pulsatile.
-    """
+    """Return the iodine concentration in mg/mL of the blood that enters a flow, over time in s, and its maximum."""
     if len(field.phases) < 2:
         return bolus.inflow([field.inflow_mL_s])
     times = [phase.time_s for phase in field.phases]
@@ -138,13 +116,7 @@ def entering(bolus: Bolus, field: FlowField) -> tuple[OverTime, float]:
 
 
 def injection(case: FlowCase, field: FlowField, settings: AngiogramSettings) -> Injection:
-    """Prepare an injection into a flow.
-
-    Raises
-    ------
-    FlowError
-        The flow does not fit in the free memory, or its flow rates cannot be balanced.
-    """
+    """Prepare an injection into a flow; one that does not fit in the free memory is refused."""
     need_bytes = memory_bytes(field)
     if need_bytes > free_memory_bytes():
         raise FlowError(
@@ -199,22 +171,37 @@ def angiogram(
             f"no contrast reaches the {'vessel' if case.sac is None else 'sac'} within {settings.window_s:g} s: give a "
             "longer window"
         )
-    balance = ready.transport.balance()
-    measures |= {"contrast_balance_error_fraction": balance.error_fraction}
+    measures |= {"contrast_balance_error_fraction": ready.transport.balance().error_fraction}
     if settings.is_preview:
         measures = {"contrast_preview_error_fraction": PREVIEW_ERROR} | measures
+    network = ready.grid.network
+    widths = " and ".join(f"{width:.3g}" for width in np.unique(network.width) * network.spacing_mm)
+    said = (
+        f"{len(network.cells):,} cells, grid spacing {widths} mm, fastest step "
+        f"{1e3 * ready.transport.fastest_s:.2g} ms, memory {memory_bytes(field) / 1e9:.2g} GB; "
+        f"the flow rates were corrected by {network.correction_fraction:.1%}."
+    )
+    if settings.is_preview:
+        said = f"Preview: {OF_PREVIEW} {said}"
+    if "washout_half_life_s" not in measures:
+        said += (
+            f" The sac keeps more than half of its peak to the end of the {settings.window_s:g} s: a longer window is "
+            "needed for half-life and retention."
+        )
     if case.sac is None:
-        return Angiogram(curves, np.zeros(0), np.zeros(0), measures, _advice(ready, field, measures, None))
-    near, own = ready.grid.near
-    found = washouts.wash_out(
+        return Angiogram(curves, measures, said)
+    near, in_sac = ready.grid.near
+    washout = wash_out(
         near,
-        own,
+        in_sac,
         end_s=MOST_WASHOUT_S,
         diffusivity_mm2_s=settings.diffusivity_mm2_s,
         told=lambda part: tell(share + (1 - share) * part),
     )
-    measures |= _stay(found, near, own, case)
-    return Angiogram(curves, found.time_s, found.left_fraction, measures, _advice(ready, field, measures, found))
+    measures |= {"mean_sac_age_s": washout.mean_age_s, "sac_age_extrapolated_fraction": washout.tail_fraction}
+    if washout.tail_fraction > 0.1:
+        said += f" {washout.tail_fraction:.0%} of the mean age is extrapolated from the last seconds of the washout."
+    return Angiogram(curves, measures | _unexchanged(washout, near, in_sac, case.vessel.lumen, case.sac), said)
 
 
 def _curves(ready: Injection, anatomy: Anatomy, watch: Watch | None, tell: Callable[[float], None]) -> Curves:
@@ -222,33 +209,28 @@ def _curves(ready: Injection, anatomy: Anatomy, watch: Watch | None, tell: Calla
     volume = ready.grid.network.volume_mm3
     parts = ready.grid.sac, _parent_cells(ready.grid, anatomy)
     weights = [volume[part] / volume[part].sum() for part in parts]
-    show = None if watch is None else watch(ready.points_mm, ready.spacing_mm)
+    show = None if watch is None else watch(ready.grid.network.points_mm, ready.grid.network.edge_mm)
     rows, bolus = [], ready.settings.bolus
     for time_s, values in ready.frames():
-        rows.append(
-            [time_s - bolus.begin_s, *(float(w @ values[part]) for w, part in zip(weights, parts, strict=True))]
-        )
+        means = [float(w @ values[part]) for w, part in zip(weights, parts, strict=True)]
+        rows.append([time_s - bolus.begin_s, *means])
         if show is not None:
             show(time_s, values)
         tell(time_s / (bolus.begin_s + ready.settings.window_s))
     table = np.array(rows)
-    table = table[table[:, 0] >= -1e-9]
-    return Curves(*table.T)
+    return Curves(*table[table[:, 0] >= -1e-9].T)
 
 
-def _stay(found: washouts.Washout, near: Network, own: Ints, case: FlowCase) -> dict[str, float]:
-    """Return mean age, and the volume and wall area without exchange after 1, 2 and 5 s."""
-    assert case.sac is not None
-    result = {"mean_sac_age_s": found.mean_age_s, "sac_age_extrapolated_fraction": found.tail_fraction}
-    wall = case.vessel.lumen
-    mine = np.flatnonzero(on_sac(wall, case.sac, 0.2 * near.spacing_mm))
-    area_mm2 = np.bincount(wall.faces.ravel(), np.repeat(wall.areas_mm2 / 3, 3), len(wall.vertices_mm))[mine]
-    beside = cKDTree(near.points_mm[own]).query(wall.vertices_mm[mine])[1]
-    weight = near.volume_mm3[own] / near.volume_mm3[own].sum()
-    volume_mm3 = abs(case.sac.volume_mm3)
-    for moment, values in zip(washouts.MOMENTS_S, found.stayed, strict=False):
-        is_old = values > washouts.STAYED
-        result[f"unexchanged_after_{moment:g}s_volume_mm3"] = float(weight[is_old].sum()) * volume_mm3
+def _unexchanged(washout: Washout, near: Network, in_sac: Ints, wall: Surface, sac: Surface) -> dict[str, float]:
+    """Return the volume and wall area of the sac without exchange after 1, 2 and 5 s."""
+    mine = np.flatnonzero(on_sac(wall, sac, 0.2 * near.spacing_mm))
+    area_mm2 = vertex_areas_mm2(wall)[mine]
+    beside = cKDTree(near.points_mm[in_sac]).query(wall.vertices_mm[mine])[1]
+    weight = near.volume_mm3[in_sac] / near.volume_mm3[in_sac].sum()
+    result = {}
+    for moment, values in zip(MOMENTS_S, washout.stayed, strict=False):
+        is_old = values > STAYED
+        result[f"unexchanged_after_{moment:g}s_volume_mm3"] = float(weight[is_old].sum()) * abs(sac.volume_mm3)
         result[f"unexchanged_after_{moment:g}s_area_mm2"] = float(area_mm2[is_old[beside]].sum())
     return result
 
@@ -267,25 +249,3 @@ def _parent_cells(grid: Grid, anatomy: Anatomy) -> Ints:
     inside: Bools = distance_mm < 0.8 * radius_mm[nearest]
     inside[grid.sac] &= not anatomy.aneurysms
     return np.flatnonzero(inside)
-
-
-def _advice(ready: Injection, field: FlowField, measures: dict[str, float], found: washouts.Washout | None) -> str:
-    """Return sentences on the grid and on what the window did not reach."""
-    grid = ready.grid.network
-    widths = sorted({float(width) * grid.spacing_mm for width in np.unique(grid.width)})
-    spacing = " and ".join(f"{width:.3g}" for width in widths)
-    said = (
-        f"{len(grid.cells):,} cells, grid spacing {spacing} mm, fastest step "
-        f"{1e3 * ready.transport.fastest_s:.2g} ms, memory {memory_bytes(field) / 1e9:.2g} GB; "
-        f"the flow rates were corrected by {grid.correction_fraction:.1%}."
-    )
-    if ready.settings.is_preview:
-        said = f"Preview: {OF_PREVIEW} {said}"
-    if "washout_half_life_s" not in measures:
-        said += (
-            f" The sac keeps more than half of its peak to the end of the {ready.settings.window_s:g} s: a longer "
-            "window is needed for half-life and retention."
-        )
-    if found is not None and found.tail_fraction > 0.1:
-        said += f" {found.tail_fraction:.0%} of the mean age is extrapolated from the last seconds of the washout."
-    return said

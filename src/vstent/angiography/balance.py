@@ -1,7 +1,6 @@
 """Smallest correction of flow rates between cells after which as much leaves every cell as enters it."""
 
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix, diags
@@ -49,53 +48,29 @@ class _Level:
         return found
 
 
-@dataclass(frozen=True, eq=False)
 class Balancer:
-    """Solver that balances flow rates on one set of cells and faces."""
+    """Solver that balances flow rates on connected cells (n, 3), through faces from `left` to `right` cells (f,)."""
 
-    left: Ints
-    """(f,) cell on the lower side of each face."""
-    right: Ints
-    """(f,) cell on the upper side."""
-    level: Any
-    """Multigrid hierarchy of the Laplacian."""
+    def __init__(self, cells: Ints, left: Ints, right: Ints) -> None:
+        n, ones = len(cells), np.ones(len(left))
+        degree = np.bincount(left, minlength=n) + np.bincount(right, minlength=n)
+        places = np.r_[left, right, np.arange(n)], np.r_[right, left, np.arange(n)]
+        matrix = csr_matrix(coo_matrix((np.r_[-ones, -ones, degree], places), shape=(n, n)))
+        self._left, self._right, self._level = left, right, _Level(matrix, cells - cells.min(axis=0))
 
     def __call__(self, flux: Floats, source: Floats, guess: Floats | None = None) -> tuple[Floats, Floats]:
-        """Return the corrected flow rates (f,) and the potential (n,) of the correction.
-
-        Shapes: `flux` (f,), `source` (n,), `guess` (n,).
-
-        Raises
-        ------
-        FlowError
-            The correction is not found.
-        """
-        right = self.inflow(flux) + source
+        """Return the flow rates (f,) corrected so that all cells balance with their source, and the potential (n,)."""
+        n = self._level.matrix.shape[0]
+        gain = np.bincount(self._right, flux, n) - np.bincount(self._left, flux, n)
+        right = np.asarray(gain, dtype=np.float64) + source
         right -= right.mean()
-        n = len(right)
-        hierarchy = LinearOperator((n, n), matvec=self.level.cycle, dtype=np.float64)
-        potential, failed = cg(self.level.matrix, right, x0=guess, rtol=TOLERANCE, maxiter=MOST_ITERATIONS, M=hierarchy)
+        hierarchy = LinearOperator((n, n), matvec=self._level.cycle, dtype=np.float64)
+        potential, failed = cg(
+            self._level.matrix, right, x0=guess, rtol=TOLERANCE, maxiter=MOST_ITERATIONS, M=hierarchy
+        )
         if failed:
             raise FlowError(
                 "the flow rates between the cells cannot be balanced, so contrast would appear from nothing: compute "
                 "the flow again with another grid spacing"
             )
-        return flux + potential[self.left] - potential[self.right], potential
-
-    def inflow(self, flux: Floats) -> Floats:
-        """Return the net flow rate (n,) into each cell through its faces."""
-        n = self.level.matrix.shape[0]
-        gain = np.bincount(self.right, flux, n) - np.bincount(self.left, flux, n)
-        return np.asarray(gain, dtype=np.float64)
-
-
-def balancer(cells: Ints, left: Ints, right: Ints) -> Balancer:
-    """Build the solver for connected cells.
-
-    Shapes: `cells` (n, 3), `left, right` (f,).
-    """
-    n, ones = len(cells), np.ones(len(left))
-    degree = np.bincount(left, minlength=n) + np.bincount(right, minlength=n)
-    places = np.r_[left, right, np.arange(n)], np.r_[right, left, np.arange(n)]
-    matrix = csr_matrix(coo_matrix((np.r_[-ones, -ones, degree], places), shape=(n, n)))
-    return Balancer(left, right, _Level(matrix, cells - cells.min(axis=0)))
+        return flux + potential[self._left] - potential[self._right], potential

@@ -50,7 +50,13 @@ class Bolus:
     def __post_init__(self) -> None:
         """Raise InputError where a value cannot be used."""
         if self.curve:
-            self._check_curve()
+            times, values = np.array(self.curve, dtype=np.float64).T
+            if not np.isfinite(self.curve).all() or (np.diff(times) <= 0).any() or times[0] < 0:
+                raise InputError("the times of the injection curve do not increase from 0 s or later: sort the rows")
+            if values.min() < 0 or values.max() <= 0:
+                raise InputError(
+                    "the injection curve has no or negative concentrations: give mg/mL of iodine, 0 or more"
+                )
             return
         for name, value in (
             ("iodine concentration", self.iodine_mg_mL),
@@ -61,14 +67,6 @@ class Bolus:
                 raise InputError(f"the {name} is {value:g}: give a positive number")
         if not (np.isfinite(self.start_s) and self.start_s >= 0):
             raise InputError(f"the injection starts at {self.start_s:g} s: give 0 s or later")
-
-    def _check_curve(self) -> None:
-        """Raise InputError where the curve cannot be used."""
-        times, values = np.array(self.curve, dtype=np.float64).T
-        if not np.isfinite(self.curve).all() or (np.diff(times) <= 0).any() or times[0] < 0:
-            raise InputError("the times of the injection curve do not increase from 0 s or later: sort the rows")
-        if values.min() < 0 or values.max() <= 0:
-            raise InputError("the injection curve has no or negative concentrations: give mg/mL of iodine, 0 or more")
 
     @property
     def duration_s(self) -> float:
@@ -85,11 +83,7 @@ class Bolus:
     ) -> tuple[OverTime, float]:
         """Return the iodine concentration of the entering blood in mg/mL as a function of time in s, and its maximum.
 
-        Parameters
-        ----------
-        flow_mL_s : (p,); flow rate through the inlets; several values of a cycle are linear in between.
-        time_s : (p,); their times.
-        period_s : length of the cycle; none for a steady flow.
+        The flow rates through the inlets (p,) at times (p,) of a cycle are linear in between; a steady flow has one.
         """
         if self.curve:
             times, values = np.array(self.curve, dtype=np.float64).T

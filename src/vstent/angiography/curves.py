@@ -43,10 +43,12 @@ class Curves:
         sac, parent, time = self.sac_mg_mL, self.parent_mg_mL, self.time_s
         if sac.max() <= 0 or parent.max() <= 0:
             return {}
-        top = int(sac.argmax())
+        top, arrived_mg_mL = int(sac.argmax()), ARRIVED * sac.max()
+        k = int(np.argmax(sac >= arrived_mg_mL))
+        part = (arrived_mg_mL - sac[k - 1]) / (sac[k] - sac[k - 1]) if k else 0.0
         half_s, parent_half_s = _falls_s(time, sac), _falls_s(time, parent)
         found = {
-            "contrast_arrival_s": _rises_s(time, sac),
+            "contrast_arrival_s": float(time[k - 1] + part * (time[k] - time[k - 1])) if k else float(time[0]),
             "contrast_peak_s": float(time[top]),
             "contrast_peak_mg_mL": float(sac[top]),
             "contrast_peak_fraction": float(sac[top] / parent.max()),
@@ -69,16 +71,6 @@ def retention_s(curves: Curves) -> tuple[float, bool] | None:
     if parent_s is None or curves.sac_mg_mL.max() <= 0:
         return None
     return (float(curves.time_s[-1]) if sac_s is None else sac_s) - parent_s, sac_s is None
-
-
-def _rises_s(time_s: Floats, values: Floats) -> float:
-    """Return when a curve first reaches a tenth of its peak."""
-    level = ARRIVED * values.max()
-    k = int(np.argmax(values >= level))
-    if k == 0:
-        return float(time_s[0])
-    part = (level - values[k - 1]) / (values[k] - values[k - 1])
-    return float(time_s[k - 1] + part * (time_s[k] - time_s[k - 1]))
 
 
 def _falls_s(time_s: Floats, values: Floats) -> float | None:

@@ -11,6 +11,7 @@ from vstent.angiography.projection import Projector, projector_of
 from vstent.angiography.view import View
 from vstent.devices.stent import Stent
 from vstent.errors import InputError
+from vstent.flow.media import cut
 from vstent.kernels import curves
 from vstent.kernels.arrays import Floats, freeze
 
@@ -70,13 +71,7 @@ class Film:
 
 
 def iodine_cm2_g(energy_keV: float) -> float:
-    """Return the mass attenuation coefficient of iodine, linear between logarithms of the table.
-
-    Raises
-    ------
-    InputError
-        The energy is below the K edge or above 150 keV.
-    """
+    """Return the mass attenuation coefficient of iodine, linear between logarithms of the table."""
     energies, values = IODINE_CM2_G.T
     if not energies[0] <= energy_keV <= energies[-1]:
         raise InputError(
@@ -93,19 +88,9 @@ def film_of(
     frame_rate_Hz: float,
     energy_keV: float = ENERGY_KEV,
 ) -> Film:
-    """Return the film of a concentration over time; frames between two given times are interpolated linearly.
+    """Return the film of the cells of a projector, from times in s and their concentration of iodine (n,) in mg/mL.
 
-    Parameters
-    ----------
-    frames : time in s and concentration of iodine (n,) in mg/mL, in the order of time.
-    projector : projector of the cells.
-    frame_rate_Hz : frames per second, from the first time given.
-    energy_keV : photon energy.
-
-    Raises
-    ------
-    InputError
-        The frame rate or the energy is out of range.
+    Frames between two given times are interpolated linearly.
     """
     check_frame_rate(frame_rate_Hz)
     per_mg_mL_mm = iodine_cm2_g(energy_keV) * CM2_G_PER
@@ -140,22 +125,14 @@ def _resampled(
 
 
 def wire_shadow(view: View, stent: Stent) -> NDArray[np.float32]:
-    """Return the absorption (rows, columns) by the wires of a device.
-
-    Parameters
-    ----------
-    view : the C-arm.
-    stent : the deployed device.
-    """
+    """Return the absorption (rows, columns) by the wires of a deployed device."""
     ends = stent.piece_starts
     vectors = stent.wire_points_mm[ends + 1] - stent.wire_points_mm[ends]
     lengths = curves.lengths(vectors)
-    parts = np.maximum(1, np.ceil(lengths / WIRE_STEP_MM).astype(int))
-    piece = np.repeat(np.arange(len(ends)), parts)
-    place = (np.arange(len(piece)) - np.repeat(np.cumsum(parts) - parts, parts) + 0.5) / parts[piece]
-    points_mm = stent.wire_points_mm[ends][piece] + place[:, None] * vectors[piece]
+    count, piece, part = cut(lengths, WIRE_STEP_MM)
+    points_mm = stent.wire_points_mm[ends][piece] + part[:, None] * vectors[piece]
     diameter_mm = 1e-3 * stent.wire_diameter_um[stent.point_wires[ends]][piece]
-    volume_mm3 = np.pi / 4 * diameter_mm**2 * lengths[piece] / parts[piece]
+    volume_mm3 = np.pi / 4 * diameter_mm**2 * lengths[piece] / count[piece]
     projector = projector_of(view, points_mm, np.cbrt(volume_mm3))
     return projector(np.full(len(piece), WIRE_PER_MM))
 
@@ -165,14 +142,8 @@ def levels_of(
 ) -> Iterator[NDArray[np.float32]]:
     """Yield the grey levels (rows, columns) of every frame, 0 (black) to 1 (white).
 
-    As on a subtracted film, the level falls linearly with the logarithm of the intensity.
-
-    Parameters
-    ----------
-    film : the film.
-    window : absorption that is shown black.
-    wires : absorption by the wires of a device; None: subtracted with the mask, as in a run after the deployment.
-    vessel : path length (rows, columns) within the lumen, to show its outline faintly; None: subtracted.
+    As on a subtracted film, the level falls linearly with the logarithm of the intensity. The absorption `window` is
+    shown black. The absorption by wires, and faintly the path length within the lumen, are added where they are given.
     """
     still = np.zeros(film.absorption.shape[1:], np.float32)
     if wires is not None:

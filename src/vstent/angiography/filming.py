@@ -56,56 +56,32 @@ def aimed(settings: FilmSettings, anatomy: Anatomy) -> FilmSettings:
 
 
 def view_for(histories: Mapping[str, History], settings: FilmSettings) -> View:
-    """Return the view of films, with a detector that shows all cells; without a direction it is frontal.
-
-    Parameters
-    ----------
-    histories : contrast by name of the flow.
-    settings : how films are taken.
-
-    Raises
-    ------
-    InputError
-        The vessel needs a larger detector than there are.
-    """
+    """Return the view of films, with a detector that shows all cells; without a direction it is frontal."""
     points = np.concatenate([one.points_mm[:: max(1, len(one.points_mm) // SOME)] for one in histories.values()])
     return fitted(points, settings.angles_rad or (0.0, 0.0), *settings.distances_mm)
 
 
 def projectors_of(view: View, histories: Mapping[str, History]) -> dict[str, Projector]:
     """Return the projector of every flow's stored values; flows on equal cells share one."""
-    found: dict[str, Projector] = {}
-    made: list[tuple[History, Projector]] = []
+    projectors: dict[str, Projector] = {}
     for name, history in histories.items():
-        same = [projector for one, projector in made if _has_equal_cells(one, history)]
-        found[name] = same[0] if same else _projector(view, history)
-        made.append((history, found[name]))
-    return found
-
-
-def _projector(view: View, history: History) -> Projector:
-    """Return the projector of the stored values of a history: the footprints of all cells that share each."""
-    cells = projector_of(view, history.points_mm, np.full(len(history.points_mm), history.spacing_mm))
-    m, n = len(history.block), history.stored.shape[1]
-    shared = csc_array((np.ones(m, np.float32), (np.arange(m), history.block)), shape=(m, n))
-    return Projector(view, cells.matrix @ shared)
-
-
-def _has_equal_cells(one: History, other: History) -> bool:
-    """Return whether two histories are of the same cells in the same blocks."""
-    return np.array_equal(one.points_mm, other.points_mm) and np.array_equal(one.block, other.block)
+        for other in projectors:
+            same = histories[other]
+            if np.array_equal(same.points_mm, history.points_mm) and np.array_equal(same.block, history.block):
+                projectors[name] = projectors[other]
+                break
+        else:
+            cells = projector_of(view, history.points_mm, np.full(len(history.points_mm), history.spacing_mm))
+            # The footprints of all cells that share a stored value are added.
+            m, n = len(history.block), history.stored.shape[1]
+            shared = csc_array((np.ones(m, np.float32), (np.arange(m), history.block)), shape=(m, n))
+            projectors[name] = Projector(view, cells.matrix @ shared)
+    return projectors
 
 
 def films_of(
     histories: Mapping[str, History], projectors: Mapping[str, Projector], settings: FilmSettings
 ) -> dict[str, Film]:
-    """Return the film of every flow by name.
-
-    Parameters
-    ----------
-    histories : contrast by name of the flow.
-    projectors : projectors by name of the flow.
-    settings : how films are taken.
-    """
+    """Return the film of every flow by name."""
     how: dict[str, Any] = {"frame_rate_Hz": settings.frame_rate_Hz, "energy_keV": settings.energy_keV}
     return {name: film_of(history.frames(), projectors[name], **how) for name, history in histories.items()}

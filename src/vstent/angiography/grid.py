@@ -39,17 +39,7 @@ class Grid:
 
 
 def grid_of(case: FlowCase, field: FlowField, *, is_preview: bool) -> Grid:
-    """Return the cells on which contrast is carried through a flow.
-
-    Parameters
-    ----------
-    is_preview : whether all cells are twice as wide.
-
-    Raises
-    ------
-    FlowError
-        The flow rates cannot be balanced, or no cell lies in the sac.
-    """
+    """Return the cells on which contrast is carried through a flow; those of a preview are twice as wide."""
     whole = network(case, field)
     if is_preview:
         whole = whole.merged(np.ones(len(whole.cells), dtype=bool))
@@ -61,22 +51,16 @@ def grid_of(case: FlowCase, field: FlowField, *, is_preview: bool) -> Grid:
 
 def _from_sac(whole: Network, sac: Surface) -> Grid:
     """Return a grid whose network has fine cells in a sac."""
-    cells = _sac_cells(whole, sac)
-    points_mm = whole.points_mm
+    points_mm, fine = whole.points_mm, int(whole.width.min())
+    is_fine = whole.width == fine
+    at_mm = whole.spacing_mm * (whole.cells[is_fine] + 0.5 * (fine - 1))  # the grid's own centers, in its own frame
+    shift_mm = np.median(points_mm[is_fine] - at_mm, axis=0)
+    inside = sampling.cells_inside(sac, at_mm + shift_mm, fine * whole.spacing_mm)
+    if len(inside) == 0:
+        raise FlowError("no cell of the flow lies in the sac: compute the flow with a finer grid spacing")
+    cells = np.flatnonzero(is_fine)[inside]
     distance_mm = np.full(len(points_mm), np.inf)
-    low, high = (end(points_mm[cells], axis=0) for end in (np.min, np.max))
+    low, high = points_mm[cells].min(axis=0), points_mm[cells].max(axis=0)
     near = np.flatnonzero(((points_mm > low - REGION_MM) & (points_mm < high + REGION_MM)).all(axis=1))
     distance_mm[near] = cKDTree(points_mm[cells]).query(points_mm[near], distance_upper_bound=REGION_MM)[0]
     return Grid(whole, cells, distance_mm)
-
-
-def _sac_cells(whole: Network, sac: Surface) -> Ints:
-    """Return the cells in a sac."""
-    fine = int(whole.width.min())
-    is_fine = whole.width == fine
-    at_mm = whole.spacing_mm * (whole.cells[is_fine] + 0.5 * (fine - 1))  # the grid's own centers, in its own frame
-    shift_mm = np.median(whole.points_mm[is_fine] - at_mm, axis=0)
-    found = sampling.cells_inside(sac, at_mm + shift_mm, fine * whole.spacing_mm)
-    if len(found) == 0:
-        raise FlowError("no cell of the flow lies in the sac: compute the flow with a finer grid spacing")
-    return np.flatnonzero(is_fine)[found]

@@ -49,18 +49,23 @@ class Layout:
 
 
 def layout(network: Network, diffusivity_mm2_s: float) -> Layout:
-    """Return a network in the order in which it is marched.
-
-    Parameters
-    ----------
-    network : cells and flow rates.
-    diffusivity_mm2_s : molecular diffusivity of the contrast agent.
-    """
-    exchange_mm3_s = diffusivity_mm2_s * _conductance_mm(network)
+    """Return a network in the order in which it is marched."""
     n = len(network.cells)
+    width = np.r_[network.width, np.zeros(network.openings)]
+    apart_mm = 0.5 * (width[network.left] + width[network.right]) * network.spacing_mm
+    is_inner = (network.left < n) & (network.right < n)
+    # Diffusive exchange per concentration difference: the area of a face over the distance of its cells.
+    exchange_mm3_s = diffusivity_mm2_s * np.where(is_inner, network.area_mm2 / apart_mm, 0.0)
+    exchanged_mm3_s = np.bincount(network.left, exchange_mm3_s, n + network.openings)
+    exchanged_mm3_s += np.bincount(network.right, exchange_mm3_s, n + network.openings)
     outflow_per_s = network.outflow_per_s
-    total_per_s = outflow_per_s + _sum_per_s(network, exchange_mm3_s)
-    level = _levels(network, total_per_s)
+    total_per_s = outflow_per_s + np.asarray(exchanged_mm3_s[:n] / network.volume_mm3)
+    slowness = total_per_s.max() / np.maximum(total_per_s, 1e-12)
+    level = np.minimum(np.floor(np.log2(slowness)), LEVELS - 1).astype(np.int64)
+    left, right = network.left[is_inner], network.right[is_inner]
+    for _ in range(LEVELS):  # neighbours differ by one level at most
+        np.minimum.at(level, left, level[right] + 1)
+        np.minimum.at(level, right, level[left] + 1)
     order = np.lexsort((_morton(network.cells // network.width.min()), level))
     number = np.r_[np.zeros(n, dtype=np.int64), n + np.arange(network.openings)]
     number[order] = np.arange(n)
@@ -69,19 +74,6 @@ def layout(network: Network, diffusivity_mm2_s: float) -> Layout:
     level = level[order]
     connections = _mesh(network, exchange_mm3_s[faces]), _groups(network, level)
     return Layout(network, order, faces, level, outflow_per_s[order], total_per_s[order], *connections)
-
-
-def _levels(network: Network, total_per_s: Floats) -> Ints:
-    """Return the level (n,) of every cell; neighbours differ by one at most."""
-    n = len(network.cells)
-    slowness = total_per_s.max() / np.maximum(total_per_s, 1e-12)
-    level = np.minimum(np.floor(np.log2(slowness)), LEVELS - 1).astype(np.int64)
-    inner = (network.left < n) & (network.right < n)
-    left, right = network.left[inner], network.right[inner]
-    for _ in range(LEVELS):
-        np.minimum.at(level, left, level[right] + 1)
-        np.minimum.at(level, right, level[left] + 1)
-    return level
 
 
 def _morton(cells: Ints) -> Ints:
@@ -131,13 +123,17 @@ def _mesh(network: Network, exchange_mm3_s: Floats) -> advection.Mesh:
     count = np.bincount(6 * cell + side, minlength=6 * n)
     share = 2 * width[cell] / (width[cell] + width[other]) / count[6 * cell + side]
     weight = np.where(other < n, share, 0.0)
+    near = np.repeat(np.arange(n, dtype=np.int32)[:, None], 6, axis=1)
+    is_inner = weight > 0
+    near[cell[is_inner], side[is_inner]] = other[is_inner]
+    near[cell[is_inner & (weight != 1)], 0] = -1
     entry = np.zeros(2 * len(f), dtype=np.uint32)
     entry[order] = np.arange(len(order))
     return advection.Mesh(
         left=network.left.astype(np.uint32),
         right=network.right.astype(np.uint32),
         axis=network.axis.astype(np.uint8),
-        near=_near(n, cell, other, side, weight),
+        near=near,
         first=np.searchsorted(cell, np.arange(n + 1)).astype(np.int32),
         face=face.astype(np.int32),
         other=other.astype(np.int32),
@@ -148,28 +144,3 @@ def _mesh(network: Network, exchange_mm3_s: Floats) -> advection.Mesh:
         per_volume=(1 / network.volume_mm3).astype(np.float32),
         conductance=exchange_mm3_s.astype(np.float32),
     )
-
-
-def _near(n: int, cell: Ints, other: Ints, side: Ints, weight: Floats) -> Ints:
-    """Return the only cell (n, 6) on every side (see `advection.Mesh.near`) from the entries of all cells."""
-    near = np.repeat(np.arange(n, dtype=np.int32)[:, None], 6, axis=1)
-    inner = weight > 0
-    near[cell[inner], side[inner]] = other[inner]
-    near[cell[inner & (weight != 1)], 0] = -1
-    return near
-
-
-def _conductance_mm(network: Network) -> Floats:
-    """Return the area of every face over the distance of its cells (f,); 0 at openings."""
-    n = len(network.cells)
-    width = np.r_[network.width, np.zeros(network.openings)]
-    apart_mm = 0.5 * (width[network.left] + width[network.right]) * network.spacing_mm
-    return np.where((network.left < n) & (network.right < n), network.area_mm2 / apart_mm, 0.0)
-
-
-def _sum_per_s(network: Network, exchange_mm3_s: Floats) -> Floats:
-    """Return the diffusive exchange (n,) of each cell over its volume."""
-    n = len(network.cells)
-    total = np.bincount(network.left, exchange_mm3_s, n + network.openings)
-    total += np.bincount(network.right, exchange_mm3_s, n + network.openings)
-    return np.asarray(total[:n] / network.volume_mm3)

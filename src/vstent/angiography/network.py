@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from vstent.angiography.balance import balancer
+from vstent.angiography.balance import Balancer
 from vstent.errors import FlowError
 from vstent.flow import domain as domains
 from vstent.flow.case import FlowCase, FlowField, Level
@@ -75,16 +75,11 @@ class Network:
         edge_mm: Floats = np.cbrt(self.volume_mm3)
         return edge_mm
 
-    @cached_property
+    @property
     def area_mm2(self) -> Floats:
-        """Area (f,) of every face."""
-        return np.square(self._narrower * self.spacing_mm)
-
-    @cached_property
-    def _narrower(self) -> Ints:
-        """Width (f,) of the narrower of the two cells of each face, in cells of the flow."""
-        beyond = np.r_[self.width, np.full(self.openings, np.iinfo(np.int32).max)]
-        return np.minimum(beyond[self.left], beyond[self.right])
+        """Area (f,) of every face: the square of the narrower of its two cells."""
+        width = np.r_[self.width, np.full(self.openings, np.iinfo(np.int32).max)]
+        return np.square(np.minimum(width[self.left], width[self.right]) * self.spacing_mm)
 
     @cached_property
     def outflow_per_s(self) -> Floats:
@@ -152,13 +147,7 @@ class Network:
         return replace(self.taken(chosen, kept, number), openings=1, inlets=0)
 
     def taken(self, cells: Ints | Bools, faces: Ints | Bools, number: Ints) -> "Network":
-        """Return the network of some cells and faces, in the order in which they are chosen.
-
-        Parameters
-        ----------
-        cells, faces : which cells and faces, as indices or as masks.
-        number : (n + openings,) new number of every cell and opening.
-        """
+        """Return the network of some cells and faces, in their order, given the new number (n + openings,) of each."""
         return replace(
             self,
             cells=self.cells[cells],
@@ -178,34 +167,55 @@ def network(case: FlowCase, field: FlowField) -> Network:
     The flow rate through a face is the mean velocity of its two cells times its area. Walls are closed, also walls
     thinner than a cell. The openings carry the flow rates of the result. The smallest change (least squares) that
     balances every cell is added, because the contrast would otherwise exceed its bounds.
-
-    Parameters
-    ----------
-    field : its flow, steady or pulsatile.
-
-    Raises
-    ------
-    FlowError
-        No cell of the flow is at an inlet, or the flow rates cannot be balanced.
     """
     field = uniform(field)
-    grid = field.finest
+    grid, n_inlets = field.finest, len(case.vessel.inlets)
     surface, face_patch, _ = domains.extend(case.vessel)
     neighbour = grid.neighbours()
     is_open = neighbour >= 0
     is_open[domains.septa(surface, neighbour, grid)] = False
     left, axis = np.nonzero(is_open[:, ALONG_AXES])
     right = neighbour[left, 2 * axis + 1]
-    at_cell, at_axis, at_sign, opening = _mouths(case, grid, neighbour, surface, face_patch)
-    kept = _connected(len(grid.cells), left, right, at_cell[opening < len(case.vessel.inlets)])
+    mouths = _mouths(case, grid, neighbour, surface, face_patch)
+    graph = coo_matrix((np.ones(len(left)), (left, right)), shape=(len(grid.cells),) * 2)
+    part = connected_components(graph, directed=False)[1]
+    kept = np.isin(part, part[mouths.cell[mouths.opening < n_inlets]])
     if not kept.any():
         raise FlowError("no cell of the flow lies at an inlet, so no contrast can enter: compute the flow again")
-    solver_faces = kept[left] & kept[right]
-    number = np.cumsum(kept) - 1
-    left, right, axis = number[left[solver_faces]], number[right[solver_faces]], axis[solver_faces]
-    at_open = kept[at_cell]
-    mouths = _Mouths(number[at_cell[at_open]], at_axis[at_open], at_sign[at_open], opening[at_open])
-    return _balanced(case, field, kept, (left, right, axis), mouths)
+    number, between, at_open = np.cumsum(kept) - 1, kept[left] & kept[right], kept[mouths.cell]
+    left, right, axis = number[left[between]], number[right[between]], axis[between]
+    mouths = _Mouths(number[mouths.cell[at_open]], mouths.axis[at_open], mouths.sign[at_open], mouths.opening[at_open])
+    cells, h = grid.cells[kept], grid.cell_size_mm
+    n, solve, guess = len(cells), Balancer(cells, left, right), None
+    rows, change, size = [], 0.0, 0.0
+    for moment in field.moments():
+        velocity = moment.finest.velocity_m_s[kept]
+        inner = 0.5 * (velocity[left, axis] + velocity[right, axis]) * h**2 * MM3_PER_ML
+        # An outlet that no cell reaches carries nothing; the others take the inflow.
+        is_reached = np.isin(n_inlets + np.arange(len(moment.outlets_mL_s)), mouths.opening)
+        outlets_mL_s = np.where(is_reached, moment.outlets_mL_s, 0.0)
+        through_mL_s = np.r_[-moment.inlets_mL_s, outlets_mL_s * (moment.inflow_mL_s / outlets_mL_s.sum())]
+        out = mouths.outflow(velocity, through_mL_s)
+        fixed, guess = solve(inner, -np.bincount(mouths.cell, out, n).astype(np.float64), guess)
+        change, size = change + ((fixed - inner) ** 2).sum(), size + (inner**2).sum()
+        rows.append(np.r_[fixed, mouths.sign * out])
+    beyond = n + mouths.opening
+    return Network(
+        cells=cells,
+        width=np.ones(n, dtype=np.int32),
+        spacing_mm=h,
+        points_mm=grid.centers_mm[kept],
+        volume_mm3=np.full(n, h**3),
+        left=np.r_[left, np.where(mouths.sign > 0, mouths.cell, beyond)],
+        right=np.r_[right, np.where(mouths.sign > 0, beyond, mouths.cell)],
+        axis=np.r_[axis, mouths.axis],
+        flux_mm3_s=np.array(rows),
+        time_s=np.array([phase.time_s for phase in field.phases] or [0.0]),
+        period_s=period_s(field),
+        openings=len(case.vessel.openings),
+        inlets=n_inlets,
+        correction_fraction=float(np.sqrt(change / size)),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,19 +234,17 @@ class _Mouths:
     def outflow(self, velocity_m_s: Floats, through_mL_s: Floats) -> Floats:
         """Return the flow rate (b,) out of each face, as the velocity has it and in total as each opening has it."""
         out = self.sign * velocity_m_s[self.cell, self.axis]
-        found = np.zeros(len(out))
+        rates = np.zeros(len(out))
         for k, total in enumerate(through_mL_s):
             own = self.opening == k
             part = np.maximum(np.sign(total) * out[own], 0.0)
             if own.any():
-                found[own] = MM3_PER_ML * total * (part / part.sum() if part.sum() > 0 else 1 / own.sum())
-        return found
+                rates[own] = MM3_PER_ML * total * (part / part.sum() if part.sum() > 0 else 1 / own.sum())
+        return rates
 
 
-def _mouths(
-    case: FlowCase, grid: Level, neighbour: Ints, surface: Surface, face_patch: Ints
-) -> tuple[Ints, Ints, Ints, Ints]:
-    """Return cell, axis, sign and opening (b,) of every face at an opening."""
+def _mouths(case: FlowCase, grid: Level, neighbour: Ints, surface: Surface, face_patch: Ints) -> _Mouths:
+    """Return the faces at the openings."""
     cell, direction = np.nonzero(neighbour[:, 1:7] < 0)
     axis, sign = direction // 2, 1 - 2 * (direction % 2)
     middle = grid.centers_mm[cell]
@@ -247,58 +255,7 @@ def _mouths(
     cell, axis, sign, middle = cell[near], axis[near], sign[near], middle[near]
     patch = face_patch[surface.closest(middle)[2]]
     is_mouth = patch > 0
-    return cell[is_mouth], axis[is_mouth], sign[is_mouth], patch[is_mouth] - 1
-
-
-def _connected(n: int, left: Ints, right: Ints, entries: Ints) -> Bools:
-    """Return the cells (n,) that are connected to the inlets."""
-    graph = coo_matrix((np.ones(len(left)), (left, right)), shape=(n, n))
-    part = connected_components(graph, directed=False)[1]
-    return np.asarray(np.isin(part, part[entries]))
-
-
-def _balanced(
-    case: FlowCase, field: FlowField, kept: Bools, faces: tuple[Ints, Ints, Ints], mouths: _Mouths
-) -> Network:
-    """Return the network of the kept cells (n,), with the flow rates of every moment balanced."""
-    left, right, axis = faces
-    grid = field.finest
-    cells = grid.cells[kept]
-    n, n_openings, h = len(cells), len(case.vessel.openings), grid.cell_size_mm
-    solve, guess = balancer(cells, left, right), None
-    rows, change, size = [], 0.0, 0.0
-    for moment in field.moments():
-        velocity = moment.finest.velocity_m_s[kept]
-        inner = 0.5 * (velocity[left, axis] + velocity[right, axis]) * h**2 * MM3_PER_ML
-        through = np.r_[-moment.inlets_mL_s, _reached(moment.outlets_mL_s, mouths, len(moment.inlets_mL_s))]
-        through[len(moment.inlets_mL_s) :] *= moment.inflow_mL_s / through[len(moment.inlets_mL_s) :].sum()
-        out = mouths.outflow(velocity, through)
-        fixed, guess = solve(inner, -np.bincount(mouths.cell, out, n).astype(np.float64), guess)
-        change, size = change + ((fixed - inner) ** 2).sum(), size + (inner**2).sum()
-        rows.append(np.r_[fixed, mouths.sign * out])
-    beyond = n + mouths.opening
-    return Network(
-        cells=cells,
-        width=np.ones(n, dtype=np.int32),
-        spacing_mm=h,
-        points_mm=grid.centers_mm[kept],
-        volume_mm3=np.full(n, h**3),
-        left=np.r_[left, np.where(mouths.sign > 0, mouths.cell, beyond)],
-        right=np.r_[right, np.where(mouths.sign > 0, beyond, mouths.cell)],
-        axis=np.r_[axis, mouths.axis],
-        flux_mm3_s=np.array(rows),
-        time_s=np.array([phase.time_s for phase in field.phases] or [0.0]),
-        period_s=period_s(field),
-        openings=n_openings,
-        inlets=len(case.vessel.inlets),
-        correction_fraction=float(np.sqrt(change / size)),
-    )
-
-
-def _reached(outlets_mL_s: Floats, mouths: _Mouths, n_inlets: int) -> Floats:
-    """Return the flow rates (k,) of the outlets, 0 where no cell is at one."""
-    is_there = np.isin(n_inlets + np.arange(len(outlets_mL_s)), mouths.opening)
-    return np.where(is_there, outlets_mL_s, 0.0)
+    return _Mouths(cell[is_mouth], axis[is_mouth], sign[is_mouth], patch[is_mouth] - 1)
 
 
 def period_s(field: FlowField) -> float:

@@ -31,13 +31,6 @@ def projector_of(view: View, points_mm: NDArray[np.floating[Any]], spacing_mm: N
     The sum over all pixels, times the area of a pixel, is the integral of the concentration over the volume, weighted
     with magnification squared over the cosine between the ray and the axis of the beam. The idea of footprints is that
     of Long, Fessler & Balter 2010 (IEEE Trans. Med. Imaging 29:1839).
-
-    Shapes: `points_mm` (n, 3), `spacing_mm` (n,).
-
-    Raises
-    ------
-    InputError
-        The source lies within the cells.
     """
     from scipy.sparse import csc_array
 

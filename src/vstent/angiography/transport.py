@@ -42,18 +42,8 @@ class Balance:
 class Transport:
     """Concentration in a network, from 0 s onwards.
 
-    Parameters
-    ----------
-    network : Network
-        Cells and flow rates.
-    diffusivity_mm2_s : float
-        Molecular diffusivity of the contrast agent.
-    initial : (n,) float, optional
-        Concentration at 0 s; 0 unless given.
-    inflow : callable, optional
-        Concentration of the blood that enters at a time in s; 0 unless given.
-    upper : float
-        Largest concentration of the inflow and at 0 s.
+    It begins as `initial` (n,). `inflow` returns the concentration of the blood that enters at a time in s. Both are 0
+    unless given, and at most `upper`.
     """
 
     def __init__(
@@ -86,13 +76,7 @@ class Transport:
         self._began = self._inside()
 
     def frames(self, interval_s: float, end_s: float) -> Iterator[Frame]:
-        """March, and yield the concentration at 0 s and after every interval.
-
-        Parameters
-        ----------
-        interval_s : time between frames.
-        end_s : time of the last frame; the iteration may be stopped before.
-        """
+        """March, and yield the concentration at 0 s and after every interval; the iteration may be stopped early."""
         top = self._laid.top
         marches = int(np.ceil(interval_s / (self.fastest_s * (1 << top)) - 1e-9))
         step_s = interval_s / marches
@@ -117,9 +101,9 @@ class Transport:
 
     def moved(self) -> Floats:
         """Return the amount (f,) that passed every face to its upper side so far, in the order as given."""
-        found = np.zeros(len(self._laid.faces))
-        found[self._laid.faces] = self._held.through
-        return found
+        amounts = np.zeros(len(self._laid.faces))
+        amounts[self._laid.faces] = self._held.through
+        return amounts
 
     def balance(self) -> Balance:
         """Return what entered, left and is inside so far."""
@@ -133,23 +117,40 @@ class Transport:
     def _march(self, start_s: float, step_s: float) -> None:
         """Advance by one step of the slowest cells, with the flow rates of its middle."""
         n, network, laid = len(self._laid.order), self.network, self._laid
-        if len(network.time_s) > 1:
-            self._flux[:] = _at_time(network, start_s + 0.5 * step_s)
+        count = len(network.time_s)
+        if count > 1:  # linear between the stored moments of the cycle
+            since_s = (start_s + 0.5 * step_s - network.time_s[0]) % network.period_s
+            place = since_s / network.period_s * count
+            first, part = int(place) % count, place - int(place)
+            self._flux[:] = (1 - part) * network.flux_mm3_s[first] + part * network.flux_mm3_s[(first + 1) % count]
             advection.drift(laid.mesh, self._flux, self._moves)
         entering = 0.0
         if self._inflow is not None:
-            first, last = self._inflow(start_s), self._inflow(start_s + step_s)
-            self._held.state[n : n + network.inlets, : advection.TIME] = first, (last - first) / step_s
-            entering = max(first, last)
+            before, after = self._inflow(start_s), self._inflow(start_s + step_s)
+            self._held.state[n : n + network.inlets, : advection.TIME] = before, (after - before) / step_s
+            entering = max(before, after)
         self._held.is_full[-1] = entering > 0
         base_s, limits = step_s / (1 << laid.top), np.array([self.upper, EMPTY * self.upper], np.float32)
         advection.march(laid.mesh, laid.groups, self._held, self._flux, self._moves, base_s, *limits)
 
 
-def _at_time(network: Network, time_s: float) -> Floats:
-    """Return the flow rates (f,) at a time, interpolated linearly between the stored moments of the cycle."""
-    count = len(network.time_s)
-    place = ((time_s - network.time_s[0]) % network.period_s) / network.period_s * count
-    first = int(place) % count
-    part = place - int(place)
-    return np.asarray((1 - part) * network.flux_mm3_s[first] + part * network.flux_mm3_s[(first + 1) % count])
+def warm() -> None:
+    """Compile the kernels ahead of their first use: march a frame through two cells."""
+    cells = np.array([[0, 0, 0], [0, 0, 1]])
+    two = Network(
+        cells=cells,
+        width=np.ones(2, dtype=np.int32),
+        spacing_mm=1.0,
+        points_mm=cells.astype(np.float64),
+        volume_mm3=np.ones(2),
+        left=np.array([0, 1, 2]),
+        right=np.array([1, 3, 0]),
+        axis=np.full(3, 2),
+        flux_mm3_s=np.ones((1, 3)),
+        time_s=np.zeros(1),
+        period_s=np.inf,
+        openings=2,
+        inlets=1,
+        correction_fraction=0.0,
+    )
+    list(Transport(two, inflow=lambda _: 1.0).frames(0.1, 0.1))

@@ -84,15 +84,7 @@ class View:
         return self.source_detector_mm / self.source_isocenter_mm
 
     def pixels_of(self, points_mm: Floats) -> tuple[Floats, Floats]:
-        """Project points.
-
-        Shapes: `points_mm` (n, 3).
-
-        Raises
-        ------
-        InputError
-            A point lies beside or behind the source.
-        """
+        """Return row and column (n, 2) and magnification (n,) of points (n, 3)."""
         seen = (points_mm - self.isocenter_mm) @ self.axes.T
         depth_mm = self.source_isocenter_mm + seen[:, 2]
         if len(depth_mm) and depth_mm.min() < 0.05 * self.source_isocenter_mm:
@@ -116,13 +108,7 @@ def axes_of(primary_rad: float, secondary_rad: float) -> Floats:
 
 
 def angles_of(text: str) -> tuple[float, float]:
-    """Return primary and secondary angle in radians of a direction such as ``LAO 30 CRA 10``, ``AP`` or ``lateral``.
-
-    Raises
-    ------
-    InputError
-        The text is not a direction, or an angle is out of range.
-    """
+    """Return primary and secondary angle in radians of a direction such as ``LAO 30 CRA 10``, ``AP`` or ``lateral``."""
     words = text.upper().split()
     if len(words) == 1 and words[0] in _NAMED:
         return _NAMED[words[0]]
@@ -146,21 +132,7 @@ def fitted(
     source_detector_mm: float = SOURCE_DETECTOR_MM,
     source_isocenter_mm: float = SOURCE_ISOCENTER_MM,
 ) -> View:
-    """Return a view whose isocenter is the middle of points and whose detector shows them all.
-
-    Parameters
-    ----------
-    points_mm : (n, 3) points to show.
-    angles_rad : primary and secondary angle of the C-arm.
-    pixel_mm : edge of a detector pixel.
-    source_detector_mm : distance from source to detector.
-    source_isocenter_mm : distance from source to isocenter.
-
-    Raises
-    ------
-    InputError
-        The shadow of the points has more than 2048 pixels along a side.
-    """
+    """Return a view whose isocenter is the middle of points (n, 3) and whose detector shows them all."""
     middle_mm = 0.5 * (points_mm.min(axis=0) + points_mm.max(axis=0))
     distances_mm = pixel_mm, source_detector_mm, source_isocenter_mm
     aim = View(*angles_rad, middle_mm, 8, 8, *distances_mm)

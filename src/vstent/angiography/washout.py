@@ -58,10 +58,7 @@ def wash_out(
     diffusivity_mm2_s: float = 0.0,
     told: Callable[[float], None] | None = None,
 ) -> Washout:
-    """March the washout of a sac.
-
-    Shapes: `sac` (s,).
-    """
+    """March the washout of a sac, which consists of some cells (s,) of a network."""
     first = np.zeros(len(network.cells))
     first[sac] = 1.0
     march = Transport(network, diffusivity_mm2_s=diffusivity_mm2_s, initial=first)
@@ -81,15 +78,11 @@ def wash_out(
             told(time_s / end_s)
         if left[-1] < ENOUGH and time_s > MOMENTS_S[-1] + 1e-6:
             break
-    decay_s = _decay_s(np.array(times), np.array(left))
+    # The time constant of the last half of the washout, at most the time marched.
+    middle = len(times) // 2
+    drop = np.log(np.maximum(left[middle], 1e-12) / np.maximum(left[-1], 1e-12))
+    decay_s = float(min((times[-1] - times[middle]) / max(drop, 1e-9), times[-1]))
     age += decay_s * last
     tail = decay_s * left[-1]
     tail_fraction = tail / (float(np.trapezoid(left, times)) + tail)
     return Washout(np.array(times), np.array(left), tuple(stayed), age, march.moved(), tail_fraction)
-
-
-def _decay_s(times: Floats, left: Floats) -> float:
-    """Return the time constant of the last half of a washout, at most the time marched."""
-    late = slice(len(times) // 2, None)
-    drop = np.log(np.maximum(left[late][0], 1e-12) / np.maximum(left[late][-1], 1e-12))
-    return float(min((times[late][-1] - times[late][0]) / max(drop, 1e-9), times[-1]))

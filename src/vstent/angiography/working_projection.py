@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from vstent.angiography.view import axes_of
 from vstent.geometry.vessel import Anatomy
-from vstent.kernels.arrays import Bools, Floats, Ints
+from vstent.kernels.arrays import Bools, Floats
 
 REACH_DEG: Final = (90, 40)
 """Largest LAO or RAO angle and largest CRA or CAU angle that are proposed; units reach them around a head."""
@@ -31,37 +31,22 @@ def working_projection(anatomy: Anatomy) -> tuple[float, float]:
     the rest of the vessel overlaps; the squared cosines of the angles between the beam and the normal of the neck, and
     between the beam and the artery at the neck; and a little for large angles. Without a sac the artery is seen with
     the least foreshortening.
-
-    Parameters
-    ----------
-    anatomy : vessel, parent artery and sacs.
     """
     walls_mm = _sac_and_rest(anatomy) if anatomy.aneurysms else None
-    reach_p, reach_s = REACH_DEG
-    coarse = 2 * STEP_DEG
-    near = _cheapest(anatomy, walls_mm, _grid((-reach_p, reach_p), (-reach_s, reach_s), coarse))
-    around = [
-        (max(angle - STEP_DEG, -reach), min(angle + STEP_DEG, reach))
-        for angle, reach in zip(near, REACH_DEG, strict=True)
-    ]
-    primary, secondary = np.radians(_cheapest(anatomy, walls_mm, _grid(around[0], around[1], STEP_DEG)))
+    limits, step = [(-reach, reach) for reach in REACH_DEG], 2 * STEP_DEG
+    for _ in range(2):  # all directions in wide steps, then those around the best
+        ticks = np.meshgrid(*(np.arange(low, high + 1, step) for low, high in limits))
+        angles_deg = np.stack(ticks, axis=-1).reshape(-1, 2)
+        axes = np.stack([axes_of(*pair) for pair in np.radians(angles_deg)])
+        cost = OF_ANGLES * np.linalg.norm(angles_deg / np.array(REACH_DEG), axis=1)
+        cost += _foreshortening(anatomy, axes[:, 2])
+        if walls_mm is not None:
+            cost += [overlap(*walls_mm, one) for one in axes]
+        best = angles_deg[int(np.argmin(np.round(cost, 9)))]
+        around = zip(best, REACH_DEG, strict=True)
+        limits, step = [(max(a - STEP_DEG, -reach), min(a + STEP_DEG, reach)) for a, reach in around], STEP_DEG
+    primary, secondary = np.radians(best)
     return float(primary), float(secondary)
-
-
-def _grid(primary: tuple[int, int], secondary: tuple[int, int], step: int) -> Ints:
-    """Return all directions (k, 2) in degrees between two pairs of limits."""
-    pairs = np.meshgrid(*(np.arange(low, high + 1, step) for low, high in (primary, secondary)))
-    return np.stack(pairs, axis=-1).reshape(-1, 2)
-
-
-def _cheapest(anatomy: Anatomy, walls_mm: tuple[Floats, Floats] | None, angles_deg: Ints) -> tuple[int, int]:
-    """Return the direction in degrees with the smallest sum of costs, of directions (k, 2)."""
-    axes = np.stack([axes_of(*pair) for pair in np.radians(angles_deg)])
-    cost = OF_ANGLES * np.linalg.norm(angles_deg / np.array(REACH_DEG), axis=1) + _foreshortening(anatomy, axes[:, 2])
-    if walls_mm is not None:
-        cost += [overlap(*walls_mm, one) for one in axes]
-    primary, secondary = angles_deg[int(np.argmin(np.round(cost, 9)))]
-    return int(primary), int(secondary)
 
 
 def _foreshortening(anatomy: Anatomy, toward: Floats) -> Floats:
@@ -87,12 +72,9 @@ def _sac_and_rest(anatomy: Anatomy) -> tuple[Floats, Floats]:
 
 
 def overlap(sac_mm: Floats, rest_mm: Floats, axes: Floats) -> float:
-    """Return the part of the shadow of the sac that lies in the shadow of the rest, in parallel light.
+    """Return the part of the sac's shadow in the shadow of the rest, in parallel light along the third axis.
 
-    Parameters
-    ----------
-    sac_mm, rest_mm : (s, 3) and (r, 3) points, closer than 0.5 mm on their surfaces.
-    axes : (3, 3) right, up and toward the detector.
+    Points on both surfaces, (s, 3) and (r, 3), are closer than 0.5 mm; the other axes are right and up.
     """
     sac, rest = ((points @ axes[:2].T) / GRID_MM for points in (sac_mm, rest_mm))
     low = np.floor(sac.min(axis=0)).astype(int) - 2

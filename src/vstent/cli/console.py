@@ -15,8 +15,7 @@ from vstent.devices.design import Design
 from vstent.devices.fit import Fitted
 from vstent.devices.ranges import MARGIN
 from vstent.devices.treatment import BARE
-from vstent.flow.convergence import Refinement
-from vstent.flow.positions import POSITIONS, Scatter
+from vstent.flow.convergence import POSITIONS, Refinement, Scatter
 from vstent.geometry.vessel import Opening
 from vstent.plan.rank import Candidate, Ranking
 from vstent.study.progress import Progress

@@ -1,6 +1,6 @@
 """Compile every kernel before its first use: ``python -m vstent.cli.warm``."""
 
-from vstent.angiography.warm import warm as warm_contrast
+from vstent.angiography.transport import warm as warm_contrast
 from vstent.flow.lattice.kernels.warm import flow
 from vstent.kernels.warm import warm as warm_shared
 

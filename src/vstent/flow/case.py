@@ -1,4 +1,4 @@
-"""Data classes of a flow computation: FlowCase with its Target and Sheets, Level and FlowField."""
+"""Data classes of a flow computation: FlowCase with its Target and Sheets, Cells, Level and FlowField."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields, replace
@@ -7,13 +7,17 @@ from functools import cached_property
 import numpy as np
 
 from vstent.devices.stent import Stent
-from vstent.flow.cells import Cells
 from vstent.flow.ends import End, FlowRate, Inflow
 from vstent.flow.settings import Blood, Numerics
 from vstent.flow.waveform import Waveform
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Vessel
-from vstent.kernels.arrays import Bools, Floats, freeze, read_only
+from vstent.kernels import voxels
+from vstent.kernels.arrays import Bools, Floats, Ints, freeze, read_only
+from vstent.kernels.directions import VELOCITIES
+
+PHASES = 20
+"""Number of equally spaced moments at which a cycle is stored."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +44,8 @@ class Sheet:
     def __post_init__(self) -> None:
         freeze(self, "points_mm", np.float64, (-1, 3))
         freeze(self, "normals", np.float64, (len(self.points_mm), 3))
-        for one in fields(self)[2:]:
-            freeze(self, one.name, np.float64, (len(self.points_mm),))
+        for column in fields(self)[2:]:
+            freeze(self, column.name, np.float64, (len(self.points_mm),))
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +114,12 @@ class FlowCase:
         return sum(not isinstance(end, Inflow | FlowRate) for end in self.ends) < 2
 
     @property
+    def pulse(self) -> Waveform:
+        """Waveform of a pulsatile flow."""
+        assert self.waveform is not None
+        return self.waveform
+
+    @property
     def settled_below(self) -> float:
         """Residual below which the flow has converged."""
         return self.numerics.tolerance if self.waveform is None else self.numerics.cycle_tolerance
@@ -119,8 +129,46 @@ class FlowCase:
         return np.ones(len(time_s)) if self.waveform is None else self.waveform.factor(time_s)
 
 
-PHASES = 20
-"""Number of equally spaced moments at which a cycle is stored."""
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Blood cells of a regular grid: the base of a `Domain`, which is computed on, and of a `Level`."""
+
+    cells: Ints
+    """(n, 3) integer coordinates, sorted; the outermost layer of the grid contains no blood."""
+    origin_mm: Floats
+    """(3,) centre of the cell (0, 0, 0)."""
+    cell_size_mm: float
+    """Grid spacing."""
+
+    def __post_init__(self) -> None:
+        freeze(self, "cells", np.int32, (-1, 3))
+        freeze(self, "origin_mm", np.float64, (3,))
+
+    @cached_property
+    def centers_mm(self) -> Floats:
+        """Cell centres (n, 3)."""
+        return self.origin_mm + self.cells * self.cell_size_mm
+
+    @cached_property
+    def index(self) -> Ints:
+        """Index of the cell at every grid point (i, j, k), -1 outside the blood."""
+        return voxels.index_of(self.cells)
+
+    def neighbours(self) -> Ints:
+        """Return the cell indices (n, 19) of every cell's neighbours, -1 where they are not blood."""
+        return np.stack([self.index[tuple((self.cells + c).T)] for c in VELOCITIES], axis=1)
+
+    def places(self, points_mm: Floats) -> Floats:
+        """Return the grid coordinates (m, 3) of points (m, 3)."""
+        return (points_mm - self.origin_mm) / self.cell_size_mm
+
+    def cells_at(self, points_mm: Floats) -> Ints:
+        """Return the cell (m,) in which each point (m, 3) lies, -1 outside the blood."""
+        place = np.rint(self.places(points_mm)).astype(int)
+        is_near = ((place >= 0) & (place < self.index.shape)).all(axis=1)
+        found = np.full(len(points_mm), -1, dtype=np.int32)
+        found[is_near] = self.index[tuple(place[is_near].T)]
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,8 +312,8 @@ class FlowField:
         result = tuple(np.ones(len(level.cells), dtype=bool) for level in self.levels)
         for k, level in enumerate(self.levels):
             for finer in self.levels[k + 1 :]:
-                found = level.cells_at(finer.centers_mm)
-                result[k][found[found >= 0]] = False
+                refined = level.cells_at(finer.centers_mm)
+                result[k][refined[refined >= 0]] = False
         return result
 
     def _joined(self, values: Iterable[Floats]) -> Floats:

@@ -9,8 +9,7 @@ from scipy import ndimage
 
 from vstent.errors import FlowError
 from vstent.flow import sampling
-from vstent.flow.case import FlowCase
-from vstent.flow.cells import Cells
+from vstent.flow.case import Cells, FlowCase
 from vstent.flow.settings import Blood
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Opening, Vessel
@@ -112,7 +111,8 @@ def too_narrow(case: FlowCase, cell_size_mm: float) -> str:
 
 def unreached(vessel: Vessel, grid: Domain) -> str:
     """Return a warning about outlets that no cell of a whole vessel's grid reaches, or an empty string."""
-    closed = [opening for opening in _unlinked(vessel, grid.link_patch) if not opening.is_inlet]
+    patches = enumerate(vessel.openings, start=1)
+    closed = [one for patch, one in patches if not one.is_inlet and patch not in grid.link_patch]
     if not closed:
         return ""
     named = ", ".join(f"{outlet.role} ({outlet.diameter_mm:.2g} mm)" for outlet in closed)
@@ -122,19 +122,8 @@ def unreached(vessel: Vessel, grid: Domain) -> str:
     )
 
 
-def _unlinked(vessel: Vessel, link_patch: Ints) -> list[Opening]:
-    """Return the openings that no link of a whole vessel's grid meets."""
-    return [opening for k, opening in enumerate(vessel.openings) if not (link_patch == k + 1).any()]
-
-
 def cells_of_sac(case: FlowCase, grid: Domain) -> Ints:
-    """Return the indices of the cells in a case's sac, or of all cells if it has none.
-
-    Raises
-    ------
-    CoarseGridError
-        No cell centre is in the sac.
-    """
+    """Return the indices of the cells in a case's sac, or of all cells if it has none."""
     if case.sac is None:
         return np.arange(len(grid.cells), dtype=np.int32)
     cells = sampling.cells_inside(case.sac, grid.centers_mm, grid.cell_size_mm)
@@ -152,21 +141,17 @@ def section_pressure_Pa(vessel: Vessel, grid: Domain, pressure_Pa: Floats) -> Fl
 
     The section is that of the opening, not the end of its extension.
     """
-
-    def mean_Pa(opening: Opening) -> float:
+    means_Pa = []
+    for opening in vessel.openings:
         offset = grid.centers_mm - opening.center_mm
         near = np.abs(offset @ opening.normal) < grid.cell_size_mm
         near &= np.linalg.norm(offset, axis=1) < 0.75 * opening.diameter_mm
-        return float(pressure_Pa[near].mean()) if near.any() else float("nan")
-
-    return np.array([mean_Pa(opening) for opening in vessel.openings])
+        means_Pa.append(float(pressure_Pa[near].mean()) if near.any() else float("nan"))
+    return np.array(means_Pa)
 
 
 def too_fast(grid: Domain, speed_m_s: Floats, blood: Blood, most: float) -> str:
-    """Return a warning about cells in which the viscosity is raised for stability, or an empty string.
-
-    Shapes: `speed_m_s` (n,).
-    """
+    """Return a warning about cells in which the viscosity is raised for stability, or an empty string."""
     cell_reynolds = speed_m_s * grid.cell_size_mm * M_PER_MM / blood.kinematic_viscosity_m2_s
     fastest = int(cell_reynolds.argmax())
     if cell_reynolds[fastest] <= most:
@@ -202,20 +187,22 @@ def mean_diameter_mm(vessel: Vessel) -> float:
 
 
 def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None) -> Domain:
-    """Discretize the blood of a vessel on a regular grid, all of it or the largest connected part in a window.
+    """Discretize the blood of a vessel on a regular grid: all that is connected to the inlet, or the most in a window.
 
-    Raises
-    ------
-    CoarseGridError
-        No cells are connected to the inlet, fewer than `MIN_CELLS` are, or none reaches another inlet.
+    A grid too coarse for that, or to reach another inlet, is refused.
     """
     surface, face_patch, sections = extend(vessel)
-    origin_mm, shape = _box(surface, cell_size_mm) if window is None else (window.origin_mm, window.mask.shape)
-    filled = voxels.fill((surface.corners_mm - origin_mm) / cell_size_mm, shape)
     if window is None:
+        # An irregular offset avoids grid lines exactly through vertices and edges of analytic shapes.
+        origin_mm = surface.vertices_mm.min(axis=0) - cell_size_mm * (2.0 + np.array([0.1327, 0.2171, 0.1733]))
+        i, j, k = np.ceil((surface.vertices_mm.max(axis=0) - origin_mm) / cell_size_mm).astype(int) + 3
+        filled = voxels.fill((surface.corners_mm - origin_mm) / cell_size_mm, (int(i), int(j), int(k)))
         inside = _connected(filled, vessel, sections[0], origin_mm, cell_size_mm)
     else:
-        inside = _largest(filled & window.mask)
+        origin_mm = window.origin_mm
+        filled = voxels.fill((surface.corners_mm - origin_mm) / cell_size_mm, window.mask.shape)
+        label, _ = ndimage.label(filled & window.mask)
+        inside = label == 1 + np.bincount(label.ravel())[1:].argmax()
     cells = np.argwhere(inside).astype(np.int32)
     if len(cells) < MIN_CELLS:
         raise CoarseGridError(
@@ -227,35 +214,15 @@ def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None) -> 
     neighbour = grid.neighbours()
     is_beyond = filled & ~inside & (window is not None)
     links = _links(surface, face_patch, neighbour, grid, is_beyond)
-    if window is None:
-        _refuse_unreached_inlet(vessel, links[3], cell_size_mm)
-    parted = septa(surface, neighbour, grid)
-    return Domain(cells, origin_mm, cell_size_mm, *links, *parted, surface, sections)
-
-
-def _refuse_unreached_inlet(vessel: Vessel, link_patch: Ints, cell_size_mm: float) -> None:
-    """Raise an error if no cell reaches an inlet; an outlet without cells only causes a warning (see `unreached`)."""
-    for opening in _unlinked(vessel, link_patch):
-        if opening.is_inlet:
+    for patch, opening in enumerate(vessel.openings, start=1):
+        # An outlet without cells only causes a warning (see `unreached`).
+        if window is None and opening.is_inlet and patch not in links[3]:
             raise CoarseGridError(
                 f"at a grid spacing of {cell_size_mm:.3g} mm no cell reaches {opening.role} "
                 f"({opening.diameter_mm:.2g} mm wide at {place(opening.center_mm)}), so no blood can enter there: use "
                 "a finer grid spacing"
             )
-
-
-def _box(surface: Surface, cell_size_mm: float) -> tuple[Floats, tuple[int, int, int]]:
-    """Return the centre (3,) of the first cell and the shape of a grid around a surface."""
-    # An irregular offset avoids grid lines exactly through vertices and edges of analytic shapes.
-    origin_mm = surface.vertices_mm.min(axis=0) - cell_size_mm * (2.0 + np.array([0.1327, 0.2171, 0.1733]))
-    shape = np.ceil((surface.vertices_mm.max(axis=0) - origin_mm) / cell_size_mm).astype(int) + 3
-    return origin_mm, (int(shape[0]), int(shape[1]), int(shape[2]))
-
-
-def _largest(inside: Bools) -> Bools:
-    """Return the mask of the largest connected part."""
-    label, _ = ndimage.label(inside)
-    return np.asarray(label == 1 + np.bincount(label.ravel())[1:].argmax())
+    return Domain(cells, origin_mm, cell_size_mm, *links, *septa(surface, neighbour, grid), surface, sections)
 
 
 def _connected(
@@ -267,15 +234,15 @@ def _connected(
         return inside
     seeds = section.mean(axis=0) - vessel.inlet.normal * cell_size_mm * np.arange(0.5, 6.0)[:, None]
     index = np.clip(np.rint((seeds - origin_mm) / cell_size_mm).astype(int), 0, np.array(inside.shape) - 1)
-    found = label[tuple(index.T)]
-    found = found[found > 0]
-    if len(found) == 0:
+    parts = label[tuple(index.T)]
+    parts = parts[parts > 0]
+    if len(parts) == 0:
         at = place(vessel.inlet.center_mm)
         raise CoarseGridError(
             f"at a grid spacing of {cell_size_mm:.3g} mm there is no blood next to the inlet at {at}: check that the "
             "inlet is an open end, or use a finer grid spacing"
         )
-    return label == np.bincount(found).argmax()
+    return label == np.bincount(parts).argmax()
 
 
 def extend(vessel: Vessel) -> tuple[Surface, Ints, tuple[Floats, ...]]:
@@ -286,11 +253,6 @@ def extend(vessel: Vessel) -> tuple[Surface, Ints, tuple[Floats, ...]]:
     surface : closed surface.
     face_patch : (m,); patch of every face: 0 wall, k + 1 the end of opening k.
     sections : tuple of (j, 3); for every opening the polygon of its end, in mm.
-
-    Raises
-    ------
-    FlowError
-        An opening does not match any open end of the lumen.
     """
     lumen, obstacles = vessel.lumen, [vessel.closed]
     vertices, faces = [lumen.vertices_mm], [lumen.faces]
@@ -298,24 +260,25 @@ def extend(vessel: Vessel) -> tuple[Surface, Ints, tuple[Floats, ...]]:
     sections: dict[int, Floats] = {}
     count = len(lumen.vertices_mm)
     for loop in lumen.boundary_loops:
-        k = _opening_of(vessel, lumen.vertices_mm[loop])
-        if k is None or k in sections:
-            ring, ring_ids = lumen.vertices_mm[loop], loop
-            patch_id = WALL
-        else:
-            ring = _extruded(vessel, k, lumen.vertices_mm[loop], obstacles)
-            obstacles.append(_tube(lumen.vertices_mm[loop], ring))
-            ring_ids = np.arange(count, count + len(loop), dtype=np.int32)
+        rim, n = lumen.vertices_mm[loop], len(loop)
+        center = triangles.polygon_centroid(rim)
+        apart = [np.linalg.norm(opening.center_mm - center) / opening.diameter_mm for opening in vessel.openings]
+        k = int(np.argmin(apart))
+        ring, ring_ids, patch_id = rim, loop, WALL
+        if apart[k] < 0.5 and k not in sections:
+            ring, ring_ids, patch_id = _extruded(vessel, k, rim, obstacles), np.arange(n, dtype=np.int32) + count, k + 1
+            own = np.arange(n, dtype=np.int32)
+            obstacles.append(Surface(np.concatenate([rim, ring]), _strip(own, own + n)))
             vertices.append(ring)
             faces.append(_strip(loop, ring_ids))
-            patch.append(np.full(2 * len(loop), WALL))
-            sections[k], patch_id = ring, k + 1
-            count += len(loop)
+            patch.append(np.full(2 * n, WALL))
+            sections[k] = ring
+            count += n
         vertices.append(triangles.polygon_centroid(ring)[None])
         faces.append(np.stack([np.roll(ring_ids, -1), ring_ids, np.full_like(ring_ids, count)], axis=1))
-        patch.append(np.full(len(loop), patch_id))
+        patch.append(np.full(n, patch_id))
         count += 1
-    missing = [vessel.openings[k].role for k in range(len(vessel.openings)) if k not in sections]
+    missing = [opening.role for k, opening in enumerate(vessel.openings) if k not in sections]
     if missing:
         raise FlowError(f"no open end of the lumen matches {', '.join(missing)}: trace the vessel again")
     surface = Surface(np.concatenate(vertices), np.concatenate(faces))
@@ -324,22 +287,13 @@ def extend(vessel: Vessel) -> tuple[Surface, Ints, tuple[Floats, ...]]:
 
 def extended_volume_mm3(vessel: Vessel) -> float:
     """Return the expected volume of a vessel with its extensions at full length."""
-    ends = (opening.area_mm2 * _extension_mm(vessel, k) for k, opening in enumerate(vessel.openings))
-    return abs(vessel.closed.volume_mm3) + sum(ends)
+    ends = sum(opening.area_mm2 * _extension_mm(opening) for opening in vessel.openings)
+    return abs(vessel.closed.volume_mm3) + ends
 
 
-def _extension_mm(vessel: Vessel, k: int) -> float:
-    """Return the full length of the extension of opening k."""
-    opening = vessel.openings[k]
+def _extension_mm(opening: Opening) -> float:
+    """Return the full length of the extension of an opening."""
     return opening.diameter_mm * (INLET_EXTENSION if opening.is_inlet else OUTLET_EXTENSION)
-
-
-def _opening_of(vessel: Vessel, ring: Floats) -> int | None:
-    """Return the index of the opening that a boundary loop (j, 3) belongs to, or None."""
-    center = triangles.polygon_centroid(ring)
-    distance = [np.linalg.norm(opening.center_mm - center) / opening.diameter_mm for opening in vessel.openings]
-    nearest = int(np.argmin(distance))
-    return nearest if distance[nearest] < 0.5 else None
 
 
 def _extruded(vessel: Vessel, k: int, ring: Floats, obstacles: Sequence[Surface]) -> Floats:
@@ -352,14 +306,8 @@ def _extruded(vessel: Vessel, k: int, ring: Floats, obstacles: Sequence[Surface]
     starts = np.concatenate([rim, 0.5 * (rim + middle), middle[None]])
     ways = np.broadcast_to(opening.normal, starts.shape)
     free = min(float(obstacle.first_hit(starts, ways).min()) for obstacle in obstacles)
-    length = outer + min(_extension_mm(vessel, k), 0.5 * free)
+    length = outer + min(_extension_mm(opening), 0.5 * free)
     return ring + (length - ahead)[:, None] * opening.normal
-
-
-def _tube(inner_mm: Floats, outer_mm: Floats) -> Surface:
-    """Return the tube between two rings (j, 3)."""
-    inner = np.arange(len(inner_mm), dtype=np.int32)
-    return Surface(np.concatenate([inner_mm, outer_mm]), _strip(inner, inner + len(inner)))
 
 
 def _strip(inner: Ints, outer: Ints) -> Ints:
@@ -385,14 +333,9 @@ def _links(
 
 
 def septa(surface: Surface, neighbour: Ints, grid: Cells) -> tuple[Ints, Ints]:
-    """Find the links between two blood cells that a wall separates.
+    """Return cell and lattice direction (s,) of the links between two blood cells that a wall separates, each once.
 
-    Parameters
-    ----------
-    surface : closed boundary of the blood.
-    neighbour : (n, 19); neighbours of the cells.
-
-    Returns (s,): cell and lattice direction of each link; every pair is listed once.
+    `neighbour` (n, 19) are the neighbours of the cells.
     """
     is_edge = np.asarray((neighbour < 0).any(axis=1))
     candidate = is_edge[:, None] & (neighbour >= 0) & is_edge[neighbour]

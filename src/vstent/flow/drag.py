@@ -35,13 +35,8 @@ refined sac."""
 def drag_per_length(diameter: Floats, spacing: Floats) -> Floats:
     """Return the drag per length of a row of cylinders over viscosity times mean velocity, F' / (mu U).
 
-    F' = 8 pi mu U / (1 - 2 ln(2 t) + 2 t^2 / 3 - t^4 / 9), t = pi d / (2 s). It is 10.70 at d / s = 1 / 6.
-
-    Shapes: `diameter, spacing` (n,).
-
-    References
-    ----------
-    Tamada and Fujikawa 1957, Q. J. Mech. Appl. Math. 10, 425.
+    F' = 8 pi mu U / (1 - 2 ln(2 t) + 2 t^2 / 3 - t^4 / 9), t = pi d / (2 s) (Tamada and Fujikawa 1957, Q. J. Mech.
+    Appl. Math. 10, 425). It is 10.70 at d / s = 1 / 6.
     """
     t = np.pi * np.minimum(diameter / spacing, 0.5) / 2
     return 8 * np.pi / (1 - 2 * np.log(2 * t) + 2 * t**2 / 3 - t**4 / 9)
@@ -68,8 +63,6 @@ def band_radius_mm(spacing_mm: Floats, cell_size_mm: float) -> Floats:
 
     It is the geometric mean of the distance between two points of the band: e^(-gamma / 2) (a + b) for points
     distributed about the axis with standard deviations a and b, where gamma is Euler's constant.
-
-    Shapes: `spacing_mm` (n,).
     """
     of_cell_mm = cell_size_mm / np.sqrt(6)
     return np.exp(-np.euler_gamma / 2) * (np.hypot(BREADTH * spacing_mm / np.sqrt(12), of_cell_mm) + of_cell_mm)
@@ -82,11 +75,6 @@ def concentration(diameter_mm: Floats, spacing_mm: Floats, cell_size_mm: float) 
     around wires as thick as their bands. The remaining part, due to the thinner wires, is the difference 1 / F' - 1 /
     F'_band. Peaceman 1978, Soc. Pet. Eng. J. 18, 183, treats wells on a grid the same way: around them the pressure is
     logarithmic, as the velocity is here.
-
-    Parameters
-    ----------
-    diameter_mm, spacing_mm : (n,); wire diameter and distance between wires.
-    cell_size_mm : grid spacing.
     """
     drag, densest = drag_per_length(diameter_mm, spacing_mm), drag_per_length(spacing_mm, spacing_mm)
     band_mm = np.maximum(2 * band_radius_mm(spacing_mm, cell_size_mm), diameter_mm)
@@ -108,8 +96,6 @@ def tangential_share(solidity: Floats, lengthwise: Floats, apart: Floats | float
 
     A slender rod has half the drag along its axis as across it. Wires in the lee of others, and the height of the two
     layers, raise the ratio: the denser the wires, the less tangential velocity remains.
-
-    Shapes: `solidity` (n,), `lengthwise` (n,), `apart` (n,).
     """
     in_lee = (1 - apart) * (SHARE_FALL + SHARE_PER_SOLIDITY * solidity)
     return 1 / np.maximum(1 / (1 - 0.5 * lengthwise) - in_lee, LEAST_SHARE)

@@ -49,13 +49,6 @@ def ends_of(vessel: Vessel, settings: FlowSettings) -> tuple[End, ...]:
 
     The inflow is shared among several inlets by Murray's law, or enters each with the default mean speed. With Murray's
     law at the outlets too, all but the widest get a flow rate, and the widest has zero pressure and takes the rest.
-
-    Parameters
-    ----------
-    vessel : Vessel
-        The vessel.
-    settings : FlowSettings
-        Settings of the flow.
     """
     inlets, outlets = vessel.inlets, vessel.outlets
     inflow_mL_s = MEAN_INLET_SPEED_M_S * np.array([inlet.area_mm2 for inlet in inlets])

@@ -6,7 +6,7 @@ progress reports are in `run`.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -158,23 +158,8 @@ def run(
 ) -> FlowField:
     """Run an engine until its residual is below the case's tolerance or its maximum number of checks is reached.
 
-    Parameters
-    ----------
-    engine : AbstractEngine
-        The engine.
-    case : FlowCase
-        The flow to compute.
-    start : FlowField, optional
-        Initial guess, on any grid; None: from rest.
-    progress : callable, optional
-        Called at every check.
-    bookmark : Bookmark, optional
-        State to resume from, and where to save it.
-
-    Raises
-    ------
-    DivergenceError
-        The computation diverged.
+    It starts from rest or from a flow on any grid, or resumes where the bookmark has a saved state. `progress` is
+    called at every check. A diverging computation raises a DivergenceError.
     """
     began = perf_counter()
     saved = None if bookmark is None else bookmark.saved
@@ -182,7 +167,8 @@ def run(
     residual = [] if saved is None else saved["residual"].tolist()
     before, loop_before = (0.0, 0.0) if saved is None else saved["seconds"].tolist()
     limit, tolerance = engine.max_checks(state), case.settled_below
-    saver, loop_began = _Saver(bookmark), perf_counter()
+    loop_began = perf_counter()
+    save_at = loop_began + SAVE_EVERY_S
 
     def seconds() -> tuple[float, float]:
         return before + perf_counter() - began, loop_before + perf_counter() - loop_began
@@ -193,54 +179,30 @@ def run(
             residual.append(reached)
             if progress is not None:
                 progress(_progress(residual, limit, tolerance, seconds()[1]))
-        if saver.is_due():
-            saver.save(engine.save(state), residual=residual, seconds=seconds())
+        if bookmark is not None and perf_counter() >= save_at:
+            save_began, arrays = perf_counter(), engine.save(state)
+            if arrays is not None:
+                bookmark.save(arrays | {"residual": np.array(residual), "seconds": np.array(seconds())})
+            now = perf_counter()
+            save_at = now + max(SAVE_EVERY_S, (now - save_began) / SAVE_SHARE)
     return engine.result(state, Outcome(residual[-1] < tolerance, tuple(residual), *seconds()))
 
 
 def stepped(engine: AbstractEngine[State], state: State) -> tuple[State, float | None]:
     """Advance an engine once, and return its state and the residual there; None between checks.
 
-    Raises
-    ------
-    DivergenceError
-        The computation diverged.
+    A Ctrl-C inside a compiled kernel, a SystemError there, becomes a KeyboardInterrupt.
     """
-    state = _step(engine, state)
-    residual = engine.terminate(state)
-    if residual is not None and np.isnan(residual):
-        raise DivergenceError(engine.trouble(state))
-    return state, residual
-
-
-class _Saver:
-    """Saves a run at intervals."""
-
-    def __init__(self, bookmark: Bookmark | None) -> None:
-        self._bookmark = bookmark
-        self._due_s = perf_counter() + SAVE_EVERY_S
-
-    def is_due(self) -> bool:
-        """Return whether the run is to be saved now."""
-        return self._bookmark is not None and perf_counter() >= self._due_s
-
-    def save(self, saved: Saved | None, **more: Sequence[float]) -> None:
-        """Save the run and schedule the next time."""
-        began = perf_counter()
-        if self._bookmark is not None and saved is not None:
-            self._bookmark.save(saved | {name: np.array(values) for name, values in more.items()})
-        now = perf_counter()
-        self._due_s = now + max(SAVE_EVERY_S, (now - began) / SAVE_SHARE)
-
-
-def _step(engine: AbstractEngine[State], state: State) -> State:
-    """Advance the engine; convert the SystemError of a Ctrl-C inside a compiled kernel to KeyboardInterrupt."""
     try:
-        return engine.step(state)
+        state = engine.step(state)
     except SystemError as error:
         if isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
             raise KeyboardInterrupt from error
         raise
+    residual = engine.terminate(state)
+    if residual is not None and np.isnan(residual):
+        raise DivergenceError(engine.trouble(state))
+    return state, residual
 
 
 def _progress(residual: list[float], limit: int, tolerance: float, seconds: float) -> Progress:

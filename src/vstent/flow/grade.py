@@ -1,6 +1,6 @@
 """Grade of a computed flow: good, fair or not usable, from stated criteria of grid, convergence and balance."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import reduce
 from typing import Final, Literal
@@ -9,11 +9,11 @@ import numpy as np
 
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.domain import mean_diameter_mm
+from vstent.flow.indices import neck_diameter_mm, parent_diameter_mm
 from vstent.flow.lattice.setup import CELL_REYNOLDS
 from vstent.flow.settings import LATTICE
-from vstent.flow.widths import neck_diameter_mm, parent_diameter_mm
 from vstent.geometry.murray import murray_shares
-from vstent.geometry.vessel import Opening
+from vstent.geometry.surface import Surface
 from vstent.kernels.arrays import Floats
 from vstent.units import M_PER_MM
 
@@ -87,12 +87,7 @@ def computation_of(case: FlowCase, field: FlowField) -> dict[str, float]:
 
 
 def grade(case: FlowCase, field: FlowField, found: Mapping[str, float]) -> Grade:
-    """Grade a flow.
-
-    Parameters
-    ----------
-    found : mapping; its indices (`vstent.flow.indices.indices`).
-    """
+    """Grade a flow from its indices (`vstent.flow.indices.indices`) and its grid."""
     return grade_of(measures_of(case, field, found))
 
 
@@ -102,16 +97,18 @@ def grade_of(measures: Mapping[str, float]) -> Grade:
     judged = [(one, measures[one.key]) for one in CRITERIA if one.key in measures]
     poor = [(one.level(value), one.phrase.format(value)) for one, value in judged if one.level(value) != GOOD]
     poor.sort(key=lambda pair: order.index(pair[0]))
-    level = poor[0][0] if poor else order[-1]
+    level = poor[0][0] if poor else GOOD
     return Grade(level, tuple(phrase for _, phrase in poor), {one.key: value for one, value in judged})
 
 
 def measures_of(case: FlowCase, field: FlowField, found: Mapping[str, float]) -> dict[str, float]:
     """Return the measures of a flow that its grade rests on; counts are in cells, fractions from 0 to 1."""
-    spacing_mm = field.finest.cell_size_mm
+    spacing_mm, outlets = field.finest.cell_size_mm, case.vessel.outlets
     measures = {"cells_across_parent_count": mean_diameter_mm(case.vessel) / spacing_mm}
     if not case.is_split_given:
-        measures["cells_across_outlet_count"] = _narrowest_mm(case.vessel.outlets) / spacing_mm
+        shares = zip(outlets, murray_shares(outlets), strict=True)
+        counted_mm = (outlet.diameter_mm for outlet, share in shares if share >= COUNTED_SHARE)
+        measures["cells_across_outlet_count"] = min(counted_mm) / spacing_mm
     if np.isfinite(field.unsettled_fraction):
         measures["unsettled_fraction"] = field.unsettled_fraction
     if case.sac is None or case.ostium is None:
@@ -119,30 +116,18 @@ def measures_of(case: FlowCase, field: FlowField, found: Mapping[str, float]) ->
     measures["cells_across_parent_count"] = parent_diameter_mm(case) / spacing_mm
     measures["cells_across_neck_count"] = neck_diameter_mm(case.ostium) / spacing_mm
     measures["cells_across_sac_count"] = float(np.cbrt(6 * abs(case.sac.volume_mm3) / np.pi)) / spacing_mm
-    measures["neck_imbalance_fraction"] = _imbalance(field, found)
+    # The part of the neck inflow that neither leaves by the neck nor through one branch of the sac.
+    net_mL_s = found["neck_inflow_mL_s"] - found["neck_outflow_mL_s"]
+    branches_mL_s: Floats = np.concatenate([[0.0], field.outlets_mL_s, -field.inlets_mL_s])
+    imbalance_mL_s = float(np.nanmin(np.abs(net_mL_s - branches_mL_s)))
+    measures["neck_imbalance_fraction"] = imbalance_mL_s / max(found["neck_inflow_mL_s"], 1e-12)
     if case.numerics.engine == LATTICE:
-        measures["raised_viscosity_fraction"] = _raised_fraction(case, field)
+        measures["raised_viscosity_fraction"] = _raised_fraction(field, case.sac, case.ostium)
     return measures
 
 
-def _narrowest_mm(outlets: Sequence[Opening]) -> float:
-    """Return the diameter of the narrowest outlet that carries a share of the flow worth counting."""
-    shares = murray_shares(outlets)
-    return min(outlet.diameter_mm for outlet, share in zip(outlets, shares, strict=True) if share >= COUNTED_SHARE)
-
-
-def _imbalance(field: FlowField, found: Mapping[str, float]) -> float:
-    """Return the part of the neck inflow that neither leaves by the neck nor through one branch of the sac."""
-    net_mL_s = found["neck_inflow_mL_s"] - found["neck_outflow_mL_s"]
-    branches: Floats = np.concatenate([[0.0], field.outlets_mL_s, -field.inlets_mL_s])
-    return float(np.nanmin(np.abs(net_mL_s - branches)) / max(found["neck_inflow_mL_s"], 1e-12))
-
-
-def _raised_fraction(case: FlowCase, field: FlowField) -> float:
+def _raised_fraction(field: FlowField, sac: Surface, ostium: Surface) -> float:
     """Return the fraction of the volume of sac and neck in which the viscosity is raised at some time."""
-    ostium, sac = case.ostium, case.sac
-    assert ostium is not None
-    assert sac is not None
     width_mm = neck_diameter_mm(ostium)
     fastest_m_s = reduce(np.maximum, (moment.speed_m_s for moment in field.moments()))
     middle_mm, reach_mm = sac.vertices_mm.mean(axis=0), np.ptp(sac.vertices_mm, axis=0).max()

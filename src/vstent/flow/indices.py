@@ -5,7 +5,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from vstent.flow import sampling
-from vstent.flow.case import FlowField
+from vstent.flow.case import FlowCase, FlowField
+from vstent.flow.domain import mean_diameter_mm
 from vstent.flow.ostium import ostium
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy, roles
@@ -64,17 +65,24 @@ def indices(field: FlowField, sac: Surface | None = None, ostium: Surface | None
     ostium : Surface, optional
         Opening of the sac, with normals into the sac.
     """
-    result = _of_vessel(field)
-    if sac is not None and ostium is not None:
-        of_moments = [_of_ostium(now, ostium) | _of_sac(now, sac) for now in field.moments()]
-        result |= {key: _over_cycle(key, [one[key] for one in of_moments]) for key in of_moments[0]}
-        result |= _quotients(result, field.inflow_mL_s, sac) | _of_sac_wall(field, sac, ostium)
-    return result
-
-
-def _over_cycle(key: str, of_moments: list[float]) -> float:
-    """Return the maximum over a cycle of an index called ``max``, else the mean."""
-    return max(of_moments) if key.startswith("max_") else float(np.mean(of_moments))
+    openings = roles(len(field.inlets_mL_s), len(field.outlets_mL_s))
+    through_mL_s = np.concatenate([field.inlets_mL_s, field.outlets_mL_s]).tolist()
+    result = {f"{role}_flow_mL_s": flow for role, flow in zip(openings, through_mL_s, strict=True)}
+    at_inlets = zip(openings, field.inlet_pressure_Pa.tolist(), strict=False)
+    result |= {f"{role}_pressure_Pa": mean for role, mean in at_inlets}
+    result["pressure_drop_Pa"] = float(field.inlet_pressure_Pa[0] - field.outlet_pressure_Pa[0])
+    result["mean_wss_Pa"] = float(np.average(field.shear_Pa, weights=vertex_areas_mm2(field.wall)))
+    if sac is None or ostium is None:
+        return result
+    of_moments = [_of_ostium(now, ostium) | _of_sac(now, sac) for now in field.moments()]
+    for key in of_moments[0]:
+        values = [one[key] for one in of_moments]
+        result[key] = max(values) if key.startswith("max_") else float(np.mean(values))
+    # Quotients of means over the cycle: those at single moments are unbounded where the flow is at rest.
+    inflow_mL_s, share = result["neck_inflow_mL_s"], result["inflow_area_fraction"]
+    result["turnover_time_s"] = abs(sac.volume_mm3) * 1e-3 / max(inflow_mL_s, 1e-12)
+    result["inflow_concentration_index"] = inflow_mL_s / field.inflow_mL_s / max(share, 1e-12)
+    return result | _of_sac_wall(field, sac, ostium)
 
 
 def ratios(before: dict[str, float], after: dict[str, float]) -> dict[str, float]:
@@ -118,38 +126,18 @@ def compare(anatomy: Anatomy, before: FlowField, after: FlowField) -> dict[str, 
     return {key: Change(first[key], second[key], change.get(f"{key}_ratio", np.nan)) for key in first if key in second}
 
 
-def _of_vessel(field: FlowField) -> dict[str, float]:
-    """Return the indices of the whole vessel."""
-    openings = roles(len(field.inlets_mL_s), len(field.outlets_mL_s))
-    through_mL_s = np.concatenate([field.inlets_mL_s, field.outlets_mL_s]).tolist()
-    return {
-        **{f"{role}_flow_mL_s": flow for role, flow in zip(openings, through_mL_s, strict=True)},
-        **{f"{role}_pressure_Pa": mean for role, mean in zip(openings, field.inlet_pressure_Pa.tolist(), strict=False)},
-        "pressure_drop_Pa": float(field.inlet_pressure_Pa[0] - field.outlet_pressure_Pa[0]),
-        "mean_wss_Pa": float(np.average(field.shear_Pa, weights=_vertex_areas_mm2(field.wall))),
-    }
-
-
 def _of_ostium(field: FlowField, ostium: Surface) -> dict[str, float]:
     """Return the indices of the flow through the ostium."""
     points_mm, area_mm2 = sampling.surface_samples(ostium, field.finest.cell_size_mm)
     through_mL_s = sampling.through_surface_mL_s(field, points_mm, area_mm2)
     sizes_mm2 = np.linalg.norm(area_mm2, axis=1)
-    told_mL_s = field.neck_inflow_mL_s
-    inflow_mL_s = sampling.inflow_mL_s(through_mL_s) if told_mL_s is None else told_mL_s
+    inflow_mL_s = field.neck_inflow_mL_s
+    if inflow_mL_s is None:
+        inflow_mL_s = sampling.inflow_mL_s(through_mL_s)
     return {
         "neck_inflow_mL_s": inflow_mL_s,
         "neck_outflow_mL_s": inflow_mL_s - float(through_mL_s.sum()),
         "inflow_area_fraction": float(sizes_mm2[through_mL_s > 0].sum() / sizes_mm2.sum()),
-    }
-
-
-def _quotients(mean: dict[str, float], entering_mL_s: float, sac: Surface) -> dict[str, float]:
-    """Return quotients of means over the cycle; quotients at single moments are unbounded where the flow is at rest."""
-    inflow_mL_s, share = mean["neck_inflow_mL_s"], mean["inflow_area_fraction"]
-    return {
-        "turnover_time_s": abs(sac.volume_mm3) * 1e-3 / max(inflow_mL_s, 1e-12),
-        "inflow_concentration_index": inflow_mL_s / entering_mL_s / max(share, 1e-12),
     }
 
 
@@ -173,21 +161,22 @@ def _of_sac(field: FlowField, sac: Surface) -> dict[str, float]:
 
 def _of_sac_wall(field: FlowField, sac: Surface, ostium: Surface) -> dict[str, float]:
     """Return the indices of wall shear stress on the sac and the parent artery."""
-    stress_Pa = field.shear_Pa
-    area_mm2 = _vertex_areas_mm2(field.wall)
+    stress_Pa, area_mm2 = field.shear_Pa, vertex_areas_mm2(field.wall)
     is_sac = on_sac(field.wall, sac, 0.2 * field.finest.cell_size_mm)
     is_near = ostium.closest(field.wall.vertices_mm)[1] < NEAR_MM
-    parent_Pa = _mean(stress_Pa, area_mm2, is_near & ~is_sac)
     moments_Pa = [np.linalg.norm(phase.wall_shear_stress_Pa[is_sac], axis=1) for phase in field.phases]
-    pulse = {}
-    if field.phases:
-        pulse["mean_sac_oscillatory_shear_fraction"] = _mean(field.oscillatory_shear_index, area_mm2, is_sac)
+
+    def mean(values: Floats | Bools, chosen: Bools = is_sac) -> float:
+        return float(np.average(values[chosen], weights=area_mm2[chosen]))
+
+    parent_Pa = mean(stress_Pa, is_near & ~is_sac)
+    pulse = {"mean_sac_oscillatory_shear_fraction": mean(field.oscillatory_shear_index)} if field.phases else {}
     return pulse | {
-        "mean_sac_wss_Pa": _mean(stress_Pa, area_mm2, is_sac),
+        "mean_sac_wss_Pa": mean(stress_Pa),
         "max_sac_wss_Pa": float(max(one_Pa.max() for one_Pa in moments_Pa or [stress_Pa[is_sac]])),
         "parent_wss_Pa": parent_Pa,
-        "low_shear_area_fraction": _mean(stress_Pa < LOW_SHEAR_PA, area_mm2, is_sac),
-        "relative_low_shear_area_fraction": _mean(stress_Pa < LOW_SHEAR_SHARE * parent_Pa, area_mm2, is_sac),
+        "low_shear_area_fraction": mean(stress_Pa < LOW_SHEAR_PA),
+        "relative_low_shear_area_fraction": mean(stress_Pa < LOW_SHEAR_SHARE * parent_Pa),
     }
 
 
@@ -196,12 +185,21 @@ def on_sac(wall: Surface, sac: Surface, tolerance_mm: float) -> Bools:
     return sac.closest(wall.vertices_mm)[1] < tolerance_mm
 
 
-def _vertex_areas_mm2(surface: Surface) -> Floats:
+def vertex_areas_mm2(surface: Surface) -> Floats:
     """Return the area (v,) of every vertex: a third of its faces."""
     area_mm2 = np.repeat(surface.areas_mm2 / 3, 3)
     return np.bincount(surface.faces.ravel(), area_mm2, len(surface.vertices_mm)).astype(np.float64)
 
 
-def _mean(values: Floats | Bools, weights: Floats, chosen: Bools) -> float:
-    """Return the weighted mean of the chosen values."""
-    return float(np.average(values[chosen], weights=weights[chosen]))
+def neck_diameter_mm(ostium: Surface) -> float:
+    """Return the diameter of a circle with the area of the ostium."""
+    return float(np.sqrt(4 * ostium.area_mm2 / np.pi))
+
+
+def parent_diameter_mm(case: FlowCase) -> float:
+    """Return the diameter of the artery beside the neck: of the widest path, a low quartile because a sac widens it."""
+    ostium = case.ostium
+    assert ostium is not None
+    near = [line.inscribed_radius_mm[ostium.closest(line.points_mm)[1] < NEAR_MM] for line in case.vessel.centerlines]
+    widths_mm = [2 * float(np.quantile(radius_mm, 0.25)) for radius_mm in near if len(radius_mm)]
+    return max(widths_mm, default=mean_diameter_mm(case.vessel))

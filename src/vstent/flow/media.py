@@ -35,14 +35,8 @@ def media(stent: Stent, blood: Blood) -> tuple[Sheet, ...]:
 
     Every piece of wire resists like a wire in a row with the local spacing, spread over a band around it. One law
     therefore covers braids, laser-cut cells and mixed wire diameters, also where bends have opened or closed the cells.
-    The bands of a braid's wires merge into a sheet; those of laser-cut struts leave the cells between them open.
-
-    Parameters
-    ----------
-    stent : Stent
-        The deployed stent.
-    blood : Blood
-        The fluid, whose viscosity scales the resistance.
+    The bands of a braid's wires merge into a sheet; those of laser-cut struts leave the cells between them open. The
+    resistance is in proportion to the blood's viscosity.
     """
     pieces = _pieces(stent)
     points_mm, along_mm, diameter_mm = pieces
@@ -60,20 +54,10 @@ def media(stent: Stent, blood: Blood) -> tuple[Sheet, ...]:
 
 
 def bands(points_mm: Floats, along_mm: Floats, normals: Floats, spacing_mm: Floats) -> tuple[Floats, Floats]:
-    """Spread pieces of wire over their bands.
+    """Spread pieces of wire, midpoints and vectors (p, 3) on a surface with normals (p, 3), over their bands.
 
-    Each of two crossing families represents half of the surface.
-
-    Parameters
-    ----------
-    points_mm, along_mm : (p, 3); midpoints of the pieces, and the vectors from end to end.
-    normals : (p, 3); unit normals of the surface that the wires span.
-    spacing_mm : (p,); local distance between wires.
-
-    Returns
-    -------
-    samples_mm : (p, `ACROSS`, 3); sample points across every band.
-    area_mm2 : (p,); area that each sample of a piece represents.
+    Each of two crossing families represents half of the surface. Returns sample points (p, `ACROSS`, 3) across every
+    band, and the area (p,) in mm2 that each sample of a piece represents.
     """
     length_mm = curves.lengths(along_mm)
     sideways = np.cross(normals, along_mm) / length_mm[:, None]
@@ -92,10 +76,11 @@ def _net(
     crossing families is then s = 2 / lambda. A piece takes the mean of the corners of the face below it.
     """
     points_mm, along_mm, diameter_mm = pieces
-    length_mm = curves.lengths(along_mm)
-    lengthwise = _lengthwise(stent, sheet.faces, face, along_mm)
+    length_mm, nodes_mm = curves.lengths(along_mm), sheet.vertices_mm
+    axis_mm = np.gradient(stent.nodes_mm, axis=0).reshape(-1, 3)[sheet.faces].mean(axis=1)
+    size_mm2 = (axis_mm**2).sum(axis=1)[face] * np.einsum("pd,pd->p", along_mm, along_mm)
+    lengthwise = np.einsum("pd,pd->p", axis_mm[face], along_mm) ** 2 / size_mm2
     columns = np.stack([length_mm, length_mm * lengthwise, length_mm * diameter_mm], axis=1)
-    nodes_mm = sheet.vertices_mm
     of_wires = nearby.sums(nodes_mm, points_mm, columns, reach_mm)
     area_mm2 = nearby.areas(nodes_mm, sheet.corners_mm, SAMPLE_REACHES * reach_mm, reach_mm)
     around = np.column_stack([area_mm2, of_wires])[sheet.faces].mean(axis=1)
@@ -113,32 +98,24 @@ def _sheet(contour: Surface, points_mm: Floats, length_mm: Floats, reach_mm: flo
     return Surface(contour.vertices_mm + mean_mm[:, None] * contour.vertex_normals, contour.faces)
 
 
-def _lengthwise(stent: Stent, faces: Ints, face: Ints, along_mm: Floats) -> Floats:
-    """Return the squared cosine (p,) of the angle between pieces of wire and the device's axis."""
-    axis_mm = np.gradient(stent.nodes_mm, axis=0).reshape(-1, 3)[faces].mean(axis=1)
-    size_mm2 = (axis_mm**2).sum(axis=1)[face] * np.einsum("pd,pd->p", along_mm, along_mm)
-    return np.asarray(np.einsum("pd,pd->p", axis_mm[face], along_mm) ** 2 / size_mm2)
-
-
 def _pieces(stent: Stent) -> tuple[Floats, Floats, Floats]:
     """Return wires cut into pieces of at most `PIECE_MM`: midpoints (p, 3), vectors (p, 3) and diameters (p,) in mm.
 
     A rectangular strut gets the diameter of the round wire with the same drag.
     """
-    inner = stent.piece_starts
+    inner, diameter_um = stent.piece_starts, stent.wire_diameter_um
+    if isinstance(stent.design, LaserCut):
+        widths_um, which = np.unique(diameter_um, return_inverse=True)
+        diameter_um = np.array([round_diameter(one, stent.design.strut_thickness_um) for one in widths_um])[which]
     a, b = stent.wire_points_mm[inner], stent.wire_points_mm[inner + 1]
-    length = np.linalg.norm(b - a, axis=1)
-    count = np.maximum(np.ceil(length / PIECE_MM).astype(int), 1)
-    owner = np.repeat(np.arange(len(a)), count)
+    count, owner, part = cut(np.linalg.norm(b - a, axis=1), PIECE_MM)
+    diameter_mm = diameter_um[stent.point_wires[inner]] * MM_PER_UM
+    return a[owner] + part[:, None] * (b - a)[owner], ((b - a) / count[:, None])[owner], diameter_mm[owner]
+
+
+def cut(length_mm: Floats, longest_mm: float) -> tuple[Ints, Ints, Floats]:
+    """Cut lines (n,) into equal pieces: return their number (n,), and of all pieces (p,) line and relative midpoint."""
+    count = np.maximum(np.ceil(length_mm / longest_mm).astype(int), 1)
+    owner = np.repeat(np.arange(len(count)), count)
     rank = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
-    part = ((rank + 0.5) / count[owner])[:, None]
-    diameter = _drag_diameters_um(stent)[stent.point_wires[inner]] * MM_PER_UM
-    return a[owner] + part * (b - a)[owner], ((b - a) / count[:, None])[owner], diameter[owner]
-
-
-def _drag_diameters_um(stent: Stent) -> Floats:
-    """Return the diameter (w,) of the round wires with the same drag as a stent's wires or struts."""
-    if not isinstance(stent.design, LaserCut):
-        return stent.wire_diameter_um
-    widths_um, which = np.unique(stent.wire_diameter_um, return_inverse=True)
-    return np.array([round_diameter(width, stent.design.strut_thickness_um) for width in widths_um])[which]
+    return count, owner, (rank + 0.5) / count[owner]

@@ -13,14 +13,7 @@ from vstent.geometry.vessel import Anatomy, Vessel
 
 
 def flow_case(anatomy: Anatomy, implants: Sequence[Stent] = (), settings: FlowSettings | None = None) -> FlowCase:
-    """Build the flow problem: the patient's lumen, its largest sac, and implants.
-
-    Parameters
-    ----------
-    anatomy : the patient's vessel and aneurysms.
-    implants : deployed implants, each included both as media and as wires over necks and ostia; none by default.
-    settings : settings of the flow.
-    """
+    """Build the flow problem of a patient's lumen and largest sac, with implants as media and as wires over ostia."""
     settings = settings or FlowSettings()
     largest = anatomy.aneurysms[0] if anatomy.aneurysms else None
     return vessel_case(
@@ -40,13 +33,7 @@ def vessel_case(
     media: tuple[Sheet, ...] = (),
     solids: tuple[Stent, ...] = (),
 ) -> FlowCase:
-    """Build the flow problem of a vessel.
-
-    Parameters
-    ----------
-    settings : settings of the flow.
-    target, media, solids : as in `FlowCase`.
-    """
+    """Build the flow problem of a vessel; `target`, `media` and `solids` are those of a `FlowCase`."""
     settings = settings or FlowSettings()
     return FlowCase(
         vessel=vessel,

@@ -7,23 +7,18 @@ from scipy import ndimage, sparse
 from scipy.sparse.linalg import spsolve
 
 from vstent.kernels import curves
-from vstent.kernels.arrays import Bools, Floats
+from vstent.kernels.arrays import Floats
 
 POINTS: Final = 64
 """Number of grid points across a section."""
 
 
 def developed_profile(section_mm: Floats, normal: Floats, points_mm: Floats) -> Floats:
-    """Return the axial speed over its mean (n,) of fully developed flow in a flat section.
+    """Return the axial speed over its mean (n,) of fully developed flow in a flat section (k, 3), at points (n, 3).
 
     Laminar flow along a straight tube with this section: lap u = -1 with u = 0 on the polygon, solved with five-point
-    differences. The result is interpolated linearly between grid points and zero outside.
-
-    Shapes: `section_mm` (k, 3), `normal` (3,), `points_mm` (n, 3).
-
-    References
-    ----------
-    White 2006, Viscous Fluid Flow, eq. 3-30.
+    differences (White 2006, Viscous Fluid Flow, eq. 3-30). The result is interpolated linearly between grid points and
+    zero outside.
     """
     center = section_mm.mean(axis=0)
     first = curves.any_perpendicular(normal)
@@ -41,22 +36,18 @@ def developed_profile(section_mm: Floats, normal: Floats, points_mm: Floats) -> 
 
 
 def _depth(polygon: Floats, points: Floats) -> Floats:
-    """Return the distance (...) of points (..., 2) from a polygon (k, 2), negative outside."""
-    nearest = np.full(points.shape[:-1], np.inf)
+    """Return the distance (...) of points (..., 2) from a polygon (k, 2), negative outside.
+
+    Points inside have an odd number of edges to their right.
+    """
+    nearest, inside = np.full(points.shape[:-1], np.inf), np.zeros(points.shape[:-1], dtype=bool)
+    x, y = points[..., 0], points[..., 1]
     for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
         along = np.clip((points - a) @ (b - a) / max(float((b - a) @ (b - a)), 1e-300), 0.0, 1.0)
         nearest = np.minimum(nearest, np.linalg.norm(points - a - along[..., None] * (b - a), axis=-1))
-    return np.where(_inside(polygon, points), nearest, -nearest)
-
-
-def _inside(polygon: Floats, points: Floats) -> Bools:
-    """Return which points (..., 2) are inside a polygon (k, 2): those with an odd number of edges to their right."""
-    result = np.zeros(points.shape[:-1], dtype=bool)
-    x, y = points[..., 0], points[..., 1]
-    for (ax, ay), (bx, by) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
-        if ay != by:
-            result ^= ((ay > y) != (by > y)) & (x < ax + (y - ay) * (bx - ax) / (by - ay))
-    return result
+        if a[1] != b[1]:
+            inside ^= ((a[1] > y) != (b[1] > y)) & (x < a[0] + (y - a[1]) * (b[0] - a[0]) / (b[1] - a[1]))
+    return np.where(inside, nearest, -nearest)
 
 
 _NEIGHBOURS: Final = ((1, 0), (-1, 0), (0, 1), (0, -1))

@@ -6,8 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from vstent.flow.case import FlowField, Level
-from vstent.flow.cells import Cells
+from vstent.flow.case import Cells, FlowField, Level
 from vstent.geometry.surface import Surface
 from vstent.kernels import sampling as lattice_sampling
 from vstent.kernels import voxels
@@ -47,18 +46,18 @@ def _on_levels(field: FlowField, points_mm: Floats) -> Iterator[tuple[Level, Boo
         yield level, chosen, level.places(points_mm[chosen])
 
 
-def _level_values(level: Level, places: Floats) -> tuple[Floats, Floats]:
-    """Return velocity (m, 3), zero outside the blood, and pressure (m,) of a level at its grid coordinates (m, 3)."""
-    velocity = lattice_sampling.interpolate(level.index, level.velocity_m_s, places, True)
-    return velocity, lattice_sampling.interpolate(level.index, level.pressure_Pa[:, None], places, False)[:, 0]
-
-
 def values_at(field: FlowField, points_mm: Floats) -> tuple[Floats, Floats]:
     """Return the velocity (m, 3), zero outside the blood, and the pressure (m,) at points (m, 3)."""
     velocity_m_s, pressure_Pa = np.zeros((len(points_mm), 3)), np.zeros(len(points_mm))
     for level, chosen, places in _on_levels(field, points_mm):
         velocity_m_s[chosen], pressure_Pa[chosen] = _level_values(level, places)
     return velocity_m_s, pressure_Pa
+
+
+def _level_values(level: Level, places: Floats) -> tuple[Floats, Floats]:
+    """Return velocity (m, 3), zero outside the blood, and pressure (m,) of a level at its grid coordinates (m, 3)."""
+    velocity = lattice_sampling.interpolate(level.index, level.velocity_m_s, places, True)
+    return velocity, lattice_sampling.interpolate(level.index, level.pressure_Pa[:, None], places, False)[:, 0]
 
 
 def through_surface_mL_s(field: FlowField, points_mm: Floats, area_mm2: Floats) -> Floats:
@@ -107,17 +106,13 @@ def surface_samples(surface: Surface, spacing_mm: float) -> tuple[Floats, Floats
     while len(corners):
         is_long = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1) > spacing_mm
         done.append(corners[~is_long])
-        corners = _quartered(corners[is_long])
+        a, b, c = np.moveaxis(corners[is_long], 1, 0)
+        ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
+        quarters = (a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)
+        corners = np.concatenate([np.stack(quarter, axis=1) for quarter in quarters])
     corners = np.concatenate(done) if done else corners
     area_mm2 = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return corners.mean(axis=1), area_mm2
-
-
-def _quartered(corners: Floats) -> Floats:
-    """Return triangles (m, 3, 3) cut at the midpoints of their edges: (4 m, 3, 3)."""
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
-    return np.concatenate([np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
 
 
 def through_mL_s(velocity_m_s: Floats, area_mm2: Floats) -> Floats:
@@ -130,8 +125,6 @@ def read_through_mL_s(grid: Cells, velocity_m_s: Floats, places: Floats, area_mm
 
     Cubic Lagrange interpolation from the surrounding 64 cells is used, because linear interpolation underestimates the
     peak of a jet (by 1 to 2 % of the neck inflow without a device).
-
-    Shapes: `velocity_m_s` (n, 3), `places` (p, 3), `area_mm2` (p, 3).
     """
     return through_mL_s(lattice_sampling.interpolate_cubic(grid.index, velocity_m_s, places), area_mm2)
 

@@ -1,6 +1,6 @@
 """Flow computation: `simulate` an anatomy with and without devices, or `simulate_case` for a single flow."""
 
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -115,26 +115,14 @@ def simulate_case(
         too; no first guess is then computed.
     folder : folder for the files of an engine that works with files, also used to resume; None: they are deleted.
     progress : called at every check; an exception that it raises ends the run.
-    checkpoint : storage for unfinished runs. The same flow resumes from there, with an identical result to the last
-        bit.
-
-    Raises
-    ------
-    FlowError
-        The vessel cannot be discretized, or the computation diverges.
+    checkpoint : storage for unfinished runs, from which the same flow resumes with an identical result to the last bit.
     """
     with nullcontext(folder) if folder is not None else TemporaryDirectory(prefix="vstent-") as own:
         return _Runs(_engine_of(case), Path(own), progress, checkpoint, similar).answer(case, start)
 
 
 def foretell_cost(case: FlowCase) -> str:
-    """Return a sentence on the expected run time and memory of a flow.
-
-    Raises
-    ------
-    FlowError
-        The case does not fit in the free memory.
-    """
+    """Return a sentence on the expected run time and memory of a flow; one that does not fit is refused."""
     return _engine_of(case)(default_cell_size_mm(case)).cost(case)
 
 
@@ -144,16 +132,16 @@ def memory_bytes(case: FlowCase) -> float | None:
 
 
 def engine_class(numerics: Numerics, *, is_pulsatile: bool) -> type[AbstractEngine[Any]]:
-    """Return the engine that the settings name: one of vstent's own or a plug-in.
+    """Return the engine that the settings name: one of vstent's own or a plug-in; unsupported settings are refused."""
+    from vstent.flow.lattice.engine import LatticeBoltzmann
+    from vstent.flow.lattice.pulse import PulsatileLatticeBoltzmann
+    from vstent.flow.openfoam.engine import OpenFoam
 
-    Raises
-    ------
-    PluginError
-        There is no engine of this name.
-    InputError
-        The settings request a GPU or a refined sac, and the engine does not support it.
-    """
-    engine = _named(numerics.engine, is_pulsatile)
+    lattice = PulsatileLatticeBoltzmann if is_pulsatile else LatticeBoltzmann
+    built_in: dict[str, type[AbstractEngine[Any]]] = {LATTICE: lattice, OPENFOAM: OpenFoam}
+    engine = built_in.get(numerics.engine) or plugins.load(
+        "vstent.engines", numerics.engine, built_in=", ".join(built_in)
+    )
     if numerics.close_up and not engine.closes_up:
         raise InputError(
             f"the engine {numerics.engine} does not support a finer grid in the sac alone: switch it off "
@@ -168,45 +156,16 @@ def engine_class(numerics: Numerics, *, is_pulsatile: bool) -> type[AbstractEngi
 
 
 def check_engine(flow: FlowSettings | None) -> None:
-    """Check that the engine of a flow exists and supports its settings, and that there is a GPU where one is requested.
-
-    Parameters
-    ----------
-    flow : settings of the flow; None: no flow is computed.
-
-    Raises
-    ------
-    PluginError
-        There is no engine of this name.
-    InputError
-        The engine does not support the settings.
-    FlowError
-        There is no usable GPU.
-    """
-    if flow is None:
-        return
-    engine_class(flow.numerics, is_pulsatile=flow.waveform is not None)
-    if flow.numerics.device_gpu:
-        require_gpu()
+    """Check that the engine of a flow, if there is one, supports its settings, and that a requested GPU is there."""
+    if flow is not None:
+        engine_class(flow.numerics, is_pulsatile=flow.waveform is not None)
+        if flow.numerics.device_gpu:
+            require_gpu()
 
 
 def _engine_of(case: FlowCase) -> type[AbstractEngine[Any]]:
     """Return the engine that computes a case."""
     return engine_class(case.numerics, is_pulsatile=case.waveform is not None)
-
-
-def _named(name: str, is_pulsatile: bool) -> type[AbstractEngine[Any]]:
-    """Return the engine of a name."""
-    from vstent.flow.lattice.engine import LatticeBoltzmann
-    from vstent.flow.lattice.pulse import PulsatileLatticeBoltzmann
-    from vstent.flow.openfoam.engine import OpenFoam
-
-    lattice = PulsatileLatticeBoltzmann if is_pulsatile else LatticeBoltzmann
-    built_in: dict[str, type[AbstractEngine[Any]]] = {LATTICE: lattice, OPENFOAM: OpenFoam}
-    if name in built_in:
-        return built_in[name]
-    found: type[AbstractEngine[Any]] = plugins.load("vstent.engines", name, built_in=", ".join(built_in))
-    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,27 +200,23 @@ class _Runs:
         Every run is begun only where a finer one needs its result; a finer one that is resumed does not. If the flow
         without a device is known, a coarse grid only provides the change due to the screen (see `_guess`).
         """
+        sizes_mm, coarsening = [size_mm], self.engine.coarsening
+        if coarsening is not None and self.similar is None and (start is None or case.media):
+            volume_mm3 = abs(case.vessel.closed.volume_mm3)
+            while volume_mm3 >= 4 * MIN_CELLS * (coarsening * sizes_mm[-1]) ** 3:
+                sizes_mm.append(coarsening * sizes_mm[-1])
         start = start if self.similar is None else self.similar
-        sizes_mm = [size_mm, *self._coarser_mm(case, size_mm, start)]
         share, runs = COARSE_SHARE, 0 if len(sizes_mm) == 1 else 1 if start is None else 2
         bare: list[Guess] = [lambda: start]
         for depth, coarse_mm in enumerate(sizes_mm[1:], start=1):
             part = (0.0, share) if depth == 1 else None
             bare.append(cache(partial(self._bare, f"bare {depth}", case, coarse_mm, bare[-1], part)))
-        found = bare[-1]
+        guess = bare[-1]
         for depth in range(len(sizes_mm) - 1, 0, -1):
             part = ((runs - 1) * share, runs * share) if depth == 1 else None
-            run_ = partial(self._run, f"guess {depth}", case, sizes_mm[depth], found, part)
-            found = cache(partial(_guess, bare[depth - 1], bare[depth], run_))
-        return self._run(name, case, size_mm, found, (runs * share, 1.0))
-
-    def _coarser_mm(self, case: FlowCase, size_mm: float, start: FlowField | None) -> Iterator[float]:
-        """Yield the spacings of the grids that provide first guesses, fine to coarse."""
-        coarsening, volume_mm3 = self.engine.coarsening, abs(case.vessel.closed.volume_mm3)
-        if coarsening is None or self.similar is not None or (start is not None and not case.media):
-            return
-        while volume_mm3 >= 4 * MIN_CELLS * (coarsening * size_mm) ** 3:
-            yield (size_mm := coarsening * size_mm)
+            run_ = partial(self._run, f"guess {depth}", case, sizes_mm[depth], guess, part)
+            guess = cache(partial(_guess, bare[depth - 1], bare[depth], run_))
+        return self._run(name, case, size_mm, guess, (runs * share, 1.0))
 
     def _bare(self, name: str, case: FlowCase, size_mm: float, finer: Guess, part: Part) -> FlowField | None:
         """Return the flow without a device on a coarse grid, from a finer one and computed only once; None without."""
@@ -285,8 +240,8 @@ class _Runs:
         progress = None if part is None else self._part(*part)
 
         def attempt() -> FlowField:
-            found = None if bookmark is not None and bookmark.saved is not None else guess()
-            start = None if found is None else sampling.uniform(found)
+            first = None if bookmark is not None and bookmark.saved is not None else guess()
+            start = None if first is None else sampling.uniform(first)
             return run(engine, case, start=start, progress=progress, bookmark=bookmark)
 
         for _ in range(CALMER_TRIES):
@@ -319,10 +274,10 @@ def _guessed(engine: AbstractEngine[Any], case: FlowCase, guess: Guess) -> FlowF
     if not case.numerics.device_gpu:
         return guess()
     with BackgroundWork(case.numerics) as background:
-        ready = background.begin(partial(engine.prepare, case))
-        found = guess()
-        ready()
-    return found
+        prepared = background.begin(partial(engine.prepare, case))
+        first = guess()
+        prepared()
+    return first
 
 
 def _guess(start: Guess, bare: Guess, stented: Callable[[], FlowField]) -> FlowField | None:

@@ -42,9 +42,14 @@ def streamlines(field: FlowField, seeds_mm: Floats) -> Streamlines:
     The method is fourth-order Runge-Kutta in arc length on trilinearly interpolated velocity. Seeds outside the blood
     give no line. Lines end at the openings, because the extensions beyond them are not part of the vessel.
     """
-    grid = sampling.uniform(field).finest
-    mouths = _mouths(field.wall, grid.cell_size_mm)
-    up, down = (_ways(grid, mouths, seeds_mm, step_cells) for step_cells in (-STEP_CELLS, STEP_CELLS))
+    grid, wall = sampling.uniform(field).finest, field.wall
+    # Caps of the openings, widened to catch lines just outside the wall.
+    vertices_mm = wall.caps.vertices_mm.copy()
+    for loop, center_mm in zip(wall.boundary_loops, wall.loop_centers_mm, strict=True):
+        outward_mm = vertices_mm[loop] - center_mm
+        vertices_mm[loop] += grid.cell_size_mm * outward_mm / np.linalg.norm(outward_mm, axis=1, keepdims=True)
+    mouths = Surface(vertices_mm, wall.caps.faces)
+    up, down = (_one_way(grid, mouths, seeds_mm, step_cells) for step_cells in (-STEP_CELLS, STEP_CELLS))
     lines = [np.concatenate([back[:0:-1], ahead]) for back, ahead in zip(up, down, strict=True)]
     lines = [line for line in lines if len(line) > 2]
     starts = np.cumsum([0, *map(len, lines)])
@@ -52,32 +57,21 @@ def streamlines(field: FlowField, seeds_mm: Floats) -> Streamlines:
     return Streamlines(joined[:, :3], starts, joined[:, 3])
 
 
-def _ways(grid: Level, mouths: Surface, seeds_mm: Floats, step_cells: float) -> list[Floats]:
-    """Return points in mm and speed (p, 4) from every seed (s, 3) in one direction, within the vessel."""
+def _one_way(grid: Level, mouths: Surface, seeds_mm: Floats, step_cells: float) -> list[Floats]:
+    """Return points in mm and speed (p, 4) from every seed (s, 3) in one direction, until they leave by a mouth."""
     seeds = np.ascontiguousarray(grid.places(seeds_mm))
     most = int(LONGEST_MM / grid.cell_size_mm / STEP_CELLS)
-    path, count = lattice_sampling.trace_all(grid.index, grid.velocity_m_s, seeds, step_cells, SLOWEST_M_S, most)
-    path[..., :3] = grid.origin_mm + path[..., :3] * grid.cell_size_mm
-    return [_within(mouths, points[:n]) for points, n in zip(path, count, strict=True)]
-
-
-def _mouths(wall: Surface, beyond_mm: float) -> Surface:
-    """Return the caps of a vessel's openings, widened by `beyond_mm` to catch lines just outside the wall."""
-    vertices_mm = wall.caps.vertices_mm.copy()
-    for loop, center_mm in zip(wall.boundary_loops, wall.loop_centers_mm, strict=True):
-        outward_mm = vertices_mm[loop] - center_mm
-        vertices_mm[loop] += beyond_mm * outward_mm / np.linalg.norm(outward_mm, axis=1, keepdims=True)
-    return Surface(vertices_mm, wall.caps.faces)
-
-
-def _within(mouths: Surface, way: Floats) -> Floats:
-    """Return a line (p, 4) up to the last point before it first leaves through an opening."""
-    step_mm = np.diff(way[:, :3], axis=0)
-    length_mm = np.linalg.norm(step_mm, axis=1)
-    ahead = step_mm / np.maximum(length_mm, 1e-12)[:, None]
-    distance_mm, face = mouths.first_hits(way[:-1, :3], ahead)
-    leaves = (distance_mm <= length_mm) & (np.einsum("ij,ij->i", mouths.normals[face], ahead) > 0)
-    return way[: int(np.argmax(leaves)) + 1] if leaves.any() else way
+    paths, count = lattice_sampling.trace_all(grid.index, grid.velocity_m_s, seeds, step_cells, SLOWEST_M_S, most)
+    paths[..., :3] = grid.origin_mm + paths[..., :3] * grid.cell_size_mm
+    lines = []
+    for path, n in zip(paths, count, strict=True):
+        step_mm = np.diff(path[:n, :3], axis=0)
+        length_mm = np.linalg.norm(step_mm, axis=1)
+        ahead = step_mm / np.maximum(length_mm, 1e-12)[:, None]
+        distance_mm, face = mouths.first_hits(path[: n - 1, :3], ahead)
+        leaves = (distance_mm <= length_mm) & (np.einsum("ij,ij->i", mouths.normals[face], ahead) > 0)
+        lines.append(path[: int(np.argmax(leaves)) + 1] if leaves.any() else path[:n])
+    return lines
 
 
 def inlet_seeds_mm(field: FlowField, vessel: Vessel, count: int) -> Floats:

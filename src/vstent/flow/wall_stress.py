@@ -20,40 +20,33 @@ def wall_stress(
 
     The stress is the tangential traction mu du/dn of the blood on the wall. It comes from a least-squares fit that is
     exact for Poiseuille flow (see `sampling.fit_wall`).
-
-    Shapes: `velocity_m_s, pressure_Pa` (n, 3).
     """
-    shear_per_s, wall_pressure_Pa = _shear(domain, velocity_m_s, pressure_Pa, lumen)
+    gradient_per_s, wall_pressure_Pa = _fit(domain, velocity_m_s, pressure_Pa, lumen)
+    shear_per_s = _along(gradient_per_s, lumen)
     viscosity_Pa_s = blood.viscosity_at_Pa_s(np.linalg.norm(shear_per_s, axis=1))
     return viscosity_Pa_s[:, None] * shear_per_s, wall_pressure_Pa
 
 
 def mean_shear_Pa(domain: Domain, velocity_m_s: Floats, speed_m_s: Floats, *, lumen: Surface, blood: Blood) -> Floats:
-    """Compute the time-averaged magnitude (v,) of the wall shear stress of an unsteady flow.
+    """Compute the mean magnitude (v,) of the wall shear stress from mean velocity (n, 3) and mean speed (n,) over time.
 
     Near a wall, speed is shear rate times distance at every moment. The excess of the mean speed over the magnitude of
     the mean velocity therefore gives the excess of the mean shear rate over that of the mean flow. The gradient of the
     mean speed alone would overestimate the stress where the flow direction rotates, because there velocities cancel and
     speeds do not.
-
-    Parameters
-    ----------
-    domain : the cells and their distance from the wall.
-    velocity_m_s, speed_m_s : (n, 3) float, (n,); Time-averaged velocity and time-averaged speed of the cells.
-    lumen : the wall, open at its ends, with outward normals.
     """
-    shear_per_s, _ = _shear(domain, velocity_m_s, np.zeros(len(speed_m_s)), lumen)
+    no_pressure_Pa = np.zeros(len(speed_m_s))
+    shear_per_s = _along(_fit(domain, velocity_m_s, no_pressure_Pa, lumen)[0], lumen)
     beyond_m_s = speed_m_s - np.linalg.norm(velocity_m_s, axis=1)
-    beyond_per_s = _fit(domain, beyond_m_s[:, None] * np.eye(3)[0], np.zeros(len(speed_m_s)), lumen)[0][:, 0]
+    beyond_per_s = _fit(domain, beyond_m_s[:, None] * np.eye(3)[0], no_pressure_Pa, lumen)[0][:, 0]
     rate_per_s = np.linalg.norm(shear_per_s, axis=1) + np.maximum(beyond_per_s, 0.0)
     return blood.viscosity_at_Pa_s(rate_per_s) * rate_per_s
 
 
-def _shear(domain: Domain, velocity_m_s: Floats, pressure_Pa: Floats, lumen: Surface) -> tuple[Floats, Floats]:
-    """Return the shear rate (v, 3) as a vector along the wall, 1/s, and the pressure (v,) at the lumen's vertices."""
-    gradient_per_s, wall_pressure_Pa = _fit(domain, velocity_m_s, pressure_Pa, lumen)
+def _along(gradient_per_s: Floats, lumen: Surface) -> Floats:
+    """Return the part along the wall of vectors (v, 3) at the lumen's vertices."""
     normal = lumen.vertex_normals
-    return gradient_per_s - np.einsum("ij,ij->i", gradient_per_s, normal)[:, None] * normal, wall_pressure_Pa
+    return gradient_per_s - np.einsum("ij,ij->i", gradient_per_s, normal)[:, None] * normal
 
 
 def _fit(domain: Domain, velocity_m_s: Floats, pressure_Pa: Floats, lumen: Surface) -> tuple[Floats, Floats]:

@@ -50,51 +50,20 @@ class Waveform:
         return 1 - harmonics.factor(time_s)
 
 
+def _numbers(text: str) -> tuple[float, ...]:
+    """Return the numbers in a text."""
+    return tuple(map(float, text.split()))
+
+
 OLDER_ADULT_ICA = Waveform(
     period_s=0.951,
-    cosine=(
-        0.04806,
-        -0.18538,
-        -0.19723,
-        -0.04749,
-        -0.14767,
-        -0.06541,
-        -0.00401,
-        0.00251,
-        0.02782,
-        0.01079,
-        -0.00106,
-        -0.00165,
-        -0.0071,
-        -0.00319,
-        -0.00202,
-        -0.00101,
-        0.00131,
-        0.00064,
-        0.00099,
-        -0.00014,
+    cosine=_numbers(
+        "0.04806 -0.18538 -0.19723 -0.04749 -0.14767 -0.06541 -0.00401 0.00251 0.02782 0.01079 -0.00106 -0.00165 "
+        "-0.0071 -0.00319 -0.00202 -0.00101 0.00131 0.00064 0.00099 -0.00014"
     ),
-    sine=(
-        0.57555,
-        0.25049,
-        0.0427,
-        0.03531,
-        0.02599,
-        -0.07995,
-        -0.04022,
-        -0.03336,
-        -0.01215,
-        0.01444,
-        0.00647,
-        0.00751,
-        0.00287,
-        -0.00182,
-        -0.00064,
-        -0.0025,
-        -0.00101,
-        -5e-05,
-        0.0004,
-        0.00123,
+    sine=_numbers(
+        "0.57555 0.25049 0.0427 0.03531 0.02599 -0.07995 -0.04022 -0.03336 -0.01215 0.01444 0.00647 0.00751 "
+        "0.00287 -0.00182 -0.00064 -0.0025 -0.00101 -5e-05 0.0004 0.00123"
     ),
 )
 """Waveform of the internal carotid artery of older adults, 20 harmonics (Hoi et al. 2010, Physiol. Meas. 31, 291)."""
@@ -105,13 +74,7 @@ RESAMPLED = 512
 
 
 def read_waveform(source: str) -> Waveform:
-    """Return the published waveform, or the one in a CSV file.
-
-    Raises
-    ------
-    InputError
-        The file holds no cardiac cycle.
-    """
+    """Return the published waveform, or the one in a CSV file."""
     from vstent.io.tables import read_columns
 
     if source == PUBLISHED:
@@ -127,15 +90,7 @@ def read_waveform(source: str) -> Waveform:
 
 
 def waveform_of(time_s: "Floats", flow: "Floats") -> Waveform:
-    """Fit a waveform to a measured cycle.
-
-    Shapes: `time_s` (n,), `flow` (n,).
-
-    Raises
-    ------
-    InputError
-        There are fewer than 5 samples, the times do not increase, or the mean flow is not positive.
-    """
+    """Fit a waveform to times and flow rates (n,) of a measured cycle."""
     import numpy as np
     from scipy.interpolate import CubicSpline
 

@@ -14,7 +14,7 @@ from vstent.anatomy.trace import trace
 from vstent.flow.case import FlowCase, Sheet
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.engines import DivergenceError, run
-from vstent.flow.indices import indices
+from vstent.flow.indices import indices, neck_diameter_mm, parent_diameter_mm
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.live import (
     CELLS_ACROSS_NECK,
@@ -31,7 +31,6 @@ from vstent.flow.lattice.stepping import twin
 from vstent.flow.media import media
 from vstent.flow.problem import flow_case
 from vstent.flow.settings import FlowSettings, Numerics
-from vstent.flow.widths import neck_diameter_mm, parent_diameter_mm
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.archive import load_data, save_data
 

@@ -13,13 +13,13 @@ from vstent.errors import InputError
 from vstent.flow import domain, sampling
 from vstent.flow import simulation as flow
 from vstent.flow.case import PHASES, FlowField
-from vstent.flow.cycles import cycle_change, cycles_advice
 from vstent.flow.lattice import pace as lattice_pace
 from vstent.flow.lattice import pulse as lattice_pulse
 from vstent.flow.lattice.pace import pace
 from vstent.flow.problem import vessel_case
 from vstent.flow.settings import FlowSettings, Numerics, Waveform
 from vstent.flow.simulation import simulate_case
+from vstent.flow.stopping import cycle_change, cycles_advice
 from vstent.flow.waveform import OLDER_ADULT_ICA, waveform_of
 from vstent.geometry.vessel import Vessel
 

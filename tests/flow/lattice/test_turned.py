@@ -14,7 +14,7 @@ from vstent.devices.catalogue import find_design
 from vstent.flow import domain, sampling
 from vstent.flow import simulation as flows
 from vstent.flow.case import FlowField
-from vstent.flow.positions import turned
+from vstent.flow.convergence import turned
 from vstent.flow.problem import flow_case, vessel_case
 from vstent.flow.settings import Blood, FlowSettings, Numerics
 from vstent.flow.simulation import simulate_case

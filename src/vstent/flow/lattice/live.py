@@ -20,6 +20,7 @@ import numpy as np
 from vstent.flow.case import FlowCase, FlowField, Level, Sheet, Target
 from vstent.flow.domain import default_cell_size_mm, extended_volume_mm3
 from vstent.flow.engines import DivergenceError, Outcome, Saved, stepped
+from vstent.flow.indices import neck_diameter_mm, parent_diameter_mm
 from vstent.flow.lattice.checkpoint import pack
 from vstent.flow.lattice.close_up import WIDTH, require_sac
 from vstent.flow.lattice.engine import LatticeBoltzmann
@@ -27,7 +28,6 @@ from vstent.flow.lattice.state import NECK_INFLOW, Snapshot, State
 from vstent.flow.lattice.stepping import advance, exchange, monitored, snapshot, twin
 from vstent.flow.lattice.trouble import trouble
 from vstent.flow.stopping import SURE, fraction_left, standard_error
-from vstent.flow.widths import neck_diameter_mm, parent_diameter_mm
 from vstent.kernels.arrays import Floats
 from vstent.units import M3_PER_ML, M_PER_MM
 

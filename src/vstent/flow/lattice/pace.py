@@ -10,7 +10,6 @@ from typing import Final
 import numpy as np
 
 from vstent.flow.case import PHASES, FlowCase, FlowField
-from vstent.flow.cycles import pulse_of
 from vstent.flow.domain import extended_volume_mm3
 from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.kernels import d3q19
@@ -58,13 +57,8 @@ def pace(case: FlowCase, cell_size_mm: float, start: FlowField | None, close_up:
     The fastest blood of each phase moves at most `lattice_speed` cells per step. A longer time step also lowers the
     lattice's speed of sound, so that more flow is stored by compressibility. Where a step is longer than the shortest,
     it is limited so that this part stays below `STORED`.
-
-    Raises
-    ------
-    FlowError
-        When the case has no waveform.
     """
-    pulse = _Pulse(pulse_of(case))
+    pulse = _Pulse(case.pulse)
     peak_m_s = pulse.peaks_m_s(case, start, close_up)
     step_s = np.array([longest_step_s(case, cell_size_mm, peak) for peak in peak_m_s])
     shortest_s = step_s.min()

@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vstent.flow.case import PHASES, FlowCase, FlowField, Phase
-from vstent.flow.cycles import cycle_change, cycles_advice, pulse_of
 from vstent.flow.engines import Outcome
 from vstent.flow.lattice.engine import AbstractLattice
 from vstent.flow.lattice.pace import pace
 from vstent.flow.lattice.reading import field_of, read
 from vstent.flow.lattice.state import State
 from vstent.flow.lattice.stepping import build, is_at_check
+from vstent.flow.stopping import cycle_change, cycles_advice
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
 
     def init(self, case: FlowCase, start: FlowField | None) -> State:
         """Set up a run whose time steps divide each phase, with a peak speed below `lattice_speed` cells per step."""
-        close_up, phase_s = self.close_up(case), pulse_of(case).period_s / PHASES
+        close_up, phase_s = self.close_up(case), case.pulse.period_s / PHASES
         steps = pace(case, self.cell_size_mm, self.pacing(start), close_up)
         return build(case, self.cell_size_mm, phase_s, steps, close_up=close_up, start=start, kept=PHASES)
 

@@ -15,7 +15,6 @@ import numpy as np
 from vstent.errors import FlowError
 from vstent.flow import domain as domains
 from vstent.flow.case import PHASES, FlowCase, FlowField, Level, Phase
-from vstent.flow.cycles import cycle_change, cycles_advice
 from vstent.flow.engines import AbstractEngine, Outcome, Saved
 from vstent.flow.openfoam import folder as folders
 from vstent.flow.openfoam import program, results
@@ -23,7 +22,7 @@ from vstent.flow.openfoam.bridge import Bridge, Snapshot, bridge, read
 from vstent.flow.openfoam.case import foam_case, strut_solids
 from vstent.flow.openfoam.cost import memory_bytes, tell_cost
 from vstent.flow.openfoam.setup import ITERATIONS, FoamSetup
-from vstent.flow.stopping import quantities_left
+from vstent.flow.stopping import cycle_change, cycles_advice, quantities_left
 from vstent.kernels.arrays import Floats, Ints
 
 CHECK_ITERATIONS: Final = 50
