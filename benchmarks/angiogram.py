@@ -20,7 +20,7 @@ from vstent.angiography.angiogram import AngiogramSettings
 from vstent.angiography.grid import grid_of
 from vstent.angiography.network import Network
 from vstent.angiography.transport import Transport
-from vstent.angiography.washout import wash_out
+from vstent.angiography.washout import INTERVAL_S, wash_out
 from vstent.flow import sampling
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.indices import indices
@@ -91,16 +91,15 @@ def ages(name: str, case: FlowCase, field: FlowField) -> None:
     grid = grid_of(case, field, is_preview=False)
     near, sac = grid.near
     found = wash_out(near, sac, end_s=angiograms.MOST_WASHOUT_S)
-    volume_mm3 = abs(case.sac.volume_mm3)
-    branch_mm3_s, branch_mm3 = (
-        _through_branch(near, sac, values, case) for values in (near.flux_mm3_s[0], found.moved_mm3)
-    )
+    march = Transport(near, initial=np.isin(np.arange(len(near.cells)), sac).astype(np.float64))
+    for _ in march.frames(INTERVAL_S, found.time_s[-1]):
+        pass
+    moved_mm3, volume_mm3 = march.moved(), abs(case.sac.volume_mm3)  # in a steady flow: flow rate times age
+    branch_mm3_s, branch_mm3 = (_through_branch(near, sac, values, case) for values in (near.flux_mm3_s[0], moved_mm3))
     inflow_mm3_s = 1e3 * _inflow_mL_s(case, field)
     carried_mm3_s = float(np.maximum(_at_ostium(case, field, near, near.flux_mm3_s[0]), 0).sum())
     # What is still in the sac at the end leaves it later.
-    leaving_mm3 = (
-        branch_mm3 - _at_ostium(case, field, near, found.moved_mm3).sum() + found.left_fraction[-1] * volume_mm3
-    )
+    leaving_mm3 = branch_mm3 - _at_ostium(case, field, near, moved_mm3).sum() + found.left_fraction[-1] * volume_mm3
     told_s = indices(field, case.sac, case.ostium)["turnover_time_s"]
     wall, cpu = time.perf_counter() - began, time.process_time() - busy
     print(

@@ -36,7 +36,7 @@ def test_values_come_back_within_half_a_step():
     buffer = np.zeros(40, np.float32)
 
     points = np.stack([np.arange(40.0), np.zeros(40), np.zeros(40)], axis=1)
-    recorder = Recorder(flow(points, 1.0), 300.0, "key", begin_s=0.2)
+    recorder = Recorder(flow(points, 1.0), 300.0, begin_s=0.2)
     take = recorder.watch(points, np.ones(40))
     for k, row in enumerate(wanted):
         buffer[:] = row
@@ -62,10 +62,9 @@ def test_no_cell_of_a_wide_block_is_lost():
 
 def test_values_beyond_the_scale_are_cut_and_the_file_gives_it_back(tmp_path):
     points = np.array([[0.0, 0, 0], [1, 0, 0]])
-    recorder = Recorder(flow(points, 1.0), 300.0, "key")
+    recorder = Recorder(flow(points, 1.0), 300.0)
     recorder.watch(points, np.ones(2))(0.0, np.array([-1.0, 400.0]))
     save_data(tmp_path / "history.npz", recorder.history())
     again = load_data(tmp_path / "history.npz", History)
     assert next(again.frames())[1] == pytest.approx([0, 300])
-    assert again.key == "key"
     assert not again.stored.flags.writeable

@@ -39,8 +39,6 @@ class History:
     """(f, n) square roots of the concentration, 0 to 255."""
     most_mg_mL: float
     """Concentration of the value 255."""
-    key: str = ""
-    """Digest of the injection and the times, by which a stored history is recognized."""
 
     def __post_init__(self) -> None:
         freeze(self, "points_mm", np.float32, (-1, 3))
@@ -62,29 +60,23 @@ class History:
 
 
 class Recorder:
-    """Stores the frames of a transport while it marches.
+    """Stores the frames of a transport through a flow while it marches.
 
-    Parameters
-    ----------
-    field : the flow that carries the contrast.
-    most_mg_mL : largest concentration; values above it are stored as that.
-    key : digest of the injection and the times.
-    begin_s : time of the transport at which the injection starts: 0 s of the history; earlier frames are left out.
+    Concentrations above the largest are stored as that. The injection starts at `begin_s` of the transport, which is
+    0 s of the history; earlier frames are left out.
     """
 
-    def __init__(self, field: FlowField, most_mg_mL: float, key: str = "", begin_s: float = 0.0) -> None:
-        self._field, self._most_mg_mL, self._key, self._begin_s = field, most_mg_mL, key, begin_s
-        self._points_mm: Floats | None = None
-        self._reach_mm = 0.0
+    def __init__(self, field: FlowField, most_mg_mL: float, begin_s: float = 0.0) -> None:
+        self._field, self._most_mg_mL, self._begin_s = field, most_mg_mL, begin_s
         self._times: list[float] = []
         self._stored: list[NDArray[np.uint8]] = []
 
     def watch(self, points_mm: Floats, edge_mm: Floats) -> Callable[[float, NDArray[Any]], None]:
         """Take centers (n, 3) in LPS and edges (n,) of the marched cells; return what takes every frame."""
         self._points_mm, self._reach_mm = points_mm, FARTHEST * float(edge_mm.max())
-        return self.add
+        return self._add
 
-    def add(self, time_s: float, values_mg_mL: NDArray[Any]) -> None:
+    def _add(self, time_s: float, values_mg_mL: NDArray[Any]) -> None:
         """Store one frame (n,); the array may be reused afterwards."""
         if time_s < self._begin_s - 1e-9:
             return
@@ -93,19 +85,11 @@ class Recorder:
         self._stored.append(np.rint(STEPS * np.sqrt(share)).astype(np.uint8))
 
     def history(self) -> History:
-        """Return all frames so far; cells of the flow share the value of the marched cell that contains them.
-
-        Raises
-        ------
-        ValueError
-            There are no frames.
-        """
-        if self._points_mm is None or not self._stored:
-            raise ValueError("no frame has been stored")
+        """Return all frames so far; cells of the flow share the value of the marched cell that contains them."""
         grid = uniform(self._field).finest
         spacing_mm, centers_mm = grid.cell_size_mm, grid.centers_mm
         distance_mm, block = cKDTree(self._points_mm).query(centers_mm)
         near = distance_mm < self._reach_mm
         stored, times = np.stack(self._stored), np.array(self._times)
         points_mm = centers_mm[near].astype(np.float32)
-        return History(points_mm, spacing_mm, np.asarray(block)[near], times, stored, self._most_mg_mL, self._key)
+        return History(points_mm, spacing_mm, np.asarray(block)[near], times, stored, self._most_mg_mL)

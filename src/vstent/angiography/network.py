@@ -179,12 +179,13 @@ def network(case: FlowCase, field: FlowField) -> Network:
     mouths = _mouths(case, grid, neighbour, surface, face_patch)
     graph = coo_matrix((np.ones(len(left)), (left, right)), shape=(len(grid.cells),) * 2)
     part = connected_components(graph, directed=False)[1]
-    kept = np.isin(part, part[mouths.cell[mouths.opening < n_inlets]])
+    kept = np.isin(part, part[mouths[mouths[:, 3] < n_inlets, 0]])
     if not kept.any():
         raise FlowError("no cell of the flow lies at an inlet, so no contrast can enter: compute the flow again")
-    number, between, at_open = np.cumsum(kept) - 1, kept[left] & kept[right], kept[mouths.cell]
+    number, between = np.cumsum(kept) - 1, kept[left] & kept[right]
     left, right, axis = number[left[between]], number[right[between]], axis[between]
-    mouths = _Mouths(number[mouths.cell[at_open]], mouths.axis[at_open], mouths.sign[at_open], mouths.opening[at_open])
+    open_cell, open_axis, sign, opening = mouths[kept[mouths[:, 0]]].T
+    open_cell = number[open_cell]
     cells, h = grid.cells[kept], grid.cell_size_mm
     n, solve, guess = len(cells), Balancer(cells, left, right), None
     rows, change, size = [], 0.0, 0.0
@@ -192,23 +193,23 @@ def network(case: FlowCase, field: FlowField) -> Network:
         velocity = moment.finest.velocity_m_s[kept]
         inner = 0.5 * (velocity[left, axis] + velocity[right, axis]) * h**2 * MM3_PER_ML
         # An outlet that no cell reaches carries nothing; the others take the inflow.
-        is_reached = np.isin(n_inlets + np.arange(len(moment.outlets_mL_s)), mouths.opening)
+        is_reached = np.isin(n_inlets + np.arange(len(moment.outlets_mL_s)), opening)
         outlets_mL_s = np.where(is_reached, moment.outlets_mL_s, 0.0)
         through_mL_s = np.r_[-moment.inlets_mL_s, outlets_mL_s * (moment.inflow_mL_s / outlets_mL_s.sum())]
-        out = mouths.outflow(velocity, through_mL_s)
-        fixed, guess = solve(inner, -np.bincount(mouths.cell, out, n).astype(np.float64), guess)
+        out = _outflow(sign * velocity[open_cell, open_axis], opening, through_mL_s)
+        fixed, guess = solve(inner, -np.bincount(open_cell, out, n).astype(np.float64), guess)
         change, size = change + ((fixed - inner) ** 2).sum(), size + (inner**2).sum()
-        rows.append(np.r_[fixed, mouths.sign * out])
-    beyond = n + mouths.opening
+        rows.append(np.r_[fixed, sign * out])
+    beyond = n + opening
     return Network(
         cells=cells,
         width=np.ones(n, dtype=np.int32),
         spacing_mm=h,
         points_mm=grid.centers_mm[kept],
         volume_mm3=np.full(n, h**3),
-        left=np.r_[left, np.where(mouths.sign > 0, mouths.cell, beyond)],
-        right=np.r_[right, np.where(mouths.sign > 0, beyond, mouths.cell)],
-        axis=np.r_[axis, mouths.axis],
+        left=np.r_[left, np.where(sign > 0, open_cell, beyond)],
+        right=np.r_[right, np.where(sign > 0, beyond, open_cell)],
+        axis=np.r_[axis, open_axis],
         flux_mm3_s=np.array(rows),
         time_s=np.array([phase.time_s for phase in field.phases] or [0.0]),
         period_s=period_s(field),
@@ -218,33 +219,19 @@ def network(case: FlowCase, field: FlowField) -> Network:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Mouths:
-    """Faces at the openings."""
-
-    cell: Ints
-    """(b,) cell of each face."""
-    axis: Ints
-    """(b,) axis across it."""
-    sign: Ints
-    """(b,) 1 where the outside is on the upper side, else -1."""
-    opening: Ints
-    """(b,) number of the opening."""
-
-    def outflow(self, velocity_m_s: Floats, through_mL_s: Floats) -> Floats:
-        """Return the flow rate (b,) out of each face, as the velocity has it and in total as each opening has it."""
-        out = self.sign * velocity_m_s[self.cell, self.axis]
-        rates = np.zeros(len(out))
-        for k, total in enumerate(through_mL_s):
-            own = self.opening == k
-            part = np.maximum(np.sign(total) * out[own], 0.0)
-            if own.any():
-                rates[own] = MM3_PER_ML * total * (part / part.sum() if part.sum() > 0 else 1 / own.sum())
-        return rates
+def _outflow(out: Floats, opening: Ints, through_mL_s: Floats) -> Floats:
+    """Return the flow rate (b,) out of faces, as their speed out has it and in total as each opening has it."""
+    rates = np.zeros(len(out))
+    for k, total in enumerate(through_mL_s):
+        own = opening == k
+        part = np.maximum(np.sign(total) * out[own], 0.0)
+        if own.any():
+            rates[own] = MM3_PER_ML * total * (part / part.sum() if part.sum() > 0 else 1 / own.sum())
+    return rates
 
 
-def _mouths(case: FlowCase, grid: Level, neighbour: Ints, surface: Surface, face_patch: Ints) -> _Mouths:
-    """Return the faces at the openings."""
+def _mouths(case: FlowCase, grid: Level, neighbour: Ints, surface: Surface, face_patch: Ints) -> Ints:
+    """Return cell, axis, sign of the way out and opening (b, 4) of the faces at openings."""
     cell, direction = np.nonzero(neighbour[:, 1:7] < 0)
     axis, sign = direction // 2, 1 - 2 * (direction % 2)
     middle = grid.centers_mm[cell]
@@ -255,7 +242,7 @@ def _mouths(case: FlowCase, grid: Level, neighbour: Ints, surface: Surface, face
     cell, axis, sign, middle = cell[near], axis[near], sign[near], middle[near]
     patch = face_patch[surface.closest(middle)[2]]
     is_mouth = patch > 0
-    return _Mouths(cell[is_mouth], axis[is_mouth], sign[is_mouth], patch[is_mouth] - 1)
+    return np.stack([cell, axis, sign, patch - 1], axis=1)[is_mouth]
 
 
 def period_s(field: FlowField) -> float:

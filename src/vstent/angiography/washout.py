@@ -30,18 +30,12 @@ class Washout:
     """(t,) part of that blood still, or again, in the sac."""
     stayed: tuple[Floats, ...]
     """For each of `MOMENTS_S` that was reached, the fraction (n,) of that blood in every cell of the sac."""
-    age_s: Floats
-    """(n,) mean time that the blood in each cell of the region has spent in the sac."""
-    moved_mm3: Floats
-    """(f,) volume of that blood that passed every face, to its upper side; in a steady flow, flow rate times age."""
     tail_fraction: float
     """Part of the mean age that is extrapolated from the last times."""
 
     def __post_init__(self) -> None:
         freeze(self, "time_s", np.float64, (-1,))
         freeze(self, "left_fraction", np.float64, (len(self.time_s),))
-        freeze(self, "age_s", np.float64, (-1,))
-        freeze(self, "moved_mm3", np.float64, (-1,))
 
     @property
     def mean_age_s(self) -> float:
@@ -66,14 +60,11 @@ def wash_out(
     times: list[float] = []
     left: list[float] = []
     stayed: list[Floats] = []
-    age, last = np.zeros(len(first)), first
     for time_s, values in march.frames(INTERVAL_S, end_s):
-        age += 0.5 * INTERVAL_S * (last + values) if times else 0.0
-        last = values.astype(np.float64)
         times.append(time_s)
         left.append(float(weight @ values[sac]))
         if any(abs(time_s - moment) < 1e-6 for moment in MOMENTS_S):
-            stayed.append(last[sac])
+            stayed.append(values[sac].astype(np.float64))
         if told is not None:
             told(time_s / end_s)
         if left[-1] < ENOUGH and time_s > MOMENTS_S[-1] + 1e-6:
@@ -82,7 +73,6 @@ def wash_out(
     middle = len(times) // 2
     drop = np.log(np.maximum(left[middle], 1e-12) / np.maximum(left[-1], 1e-12))
     decay_s = float(min((times[-1] - times[middle]) / max(drop, 1e-9), times[-1]))
-    age += decay_s * last
     tail = decay_s * left[-1]
     tail_fraction = tail / (float(np.trapezoid(left, times)) + tail)
-    return Washout(np.array(times), np.array(left), tuple(stayed), age, march.moved(), tail_fraction)
+    return Washout(np.array(times), np.array(left), tuple(stayed), tail_fraction)

@@ -54,16 +54,6 @@ class Outcome:
     """Run time of the loop alone."""
 
 
-@dataclass(frozen=True, eq=False)
-class Bookmark:
-    """Saved state from which a run resumes, and the function that saves it."""
-
-    saved: Saved | None
-    """Last saved state of the run; None: the run starts from the beginning."""
-    save: Callable[[Saved], None]
-    """Called with the state of the run from time to time."""
-
-
 class DivergenceError(FlowError):
     """A computation diverged."""
 
@@ -154,15 +144,15 @@ def run(
     *,
     start: FlowField | None = None,
     progress: Callable[[Progress], None] | None = None,
-    bookmark: Bookmark | None = None,
+    saved: Saved | None = None,
+    save: Callable[[Saved], None] | None = None,
 ) -> FlowField:
     """Run an engine until its residual is below the case's tolerance or its maximum number of checks is reached.
 
-    It starts from rest or from a flow on any grid, or resumes where the bookmark has a saved state. `progress` is
-    called at every check. A diverging computation raises a DivergenceError.
+    It starts from rest or from a flow on any grid, or resumes from a saved state. `progress` is called at every check,
+    `save` with the state from time to time. A diverging computation raises a DivergenceError.
     """
     began = perf_counter()
-    saved = None if bookmark is None else bookmark.saved
     state = engine.init(case, start) if saved is None else engine.resume(case, saved)
     residual = [] if saved is None else saved["residual"].tolist()
     before, loop_before = (0.0, 0.0) if saved is None else saved["seconds"].tolist()
@@ -179,10 +169,10 @@ def run(
             residual.append(reached)
             if progress is not None:
                 progress(_progress(residual, limit, tolerance, seconds()[1]))
-        if bookmark is not None and perf_counter() >= save_at:
+        if save is not None and perf_counter() >= save_at:
             save_began, arrays = perf_counter(), engine.save(state)
             if arrays is not None:
-                bookmark.save(arrays | {"residual": np.array(residual), "seconds": np.array(seconds())})
+                save(arrays | {"residual": np.array(residual), "seconds": np.array(seconds())})
             now = perf_counter()
             save_at = now + max(SAVE_EVERY_S, (now - save_began) / SAVE_SHARE)
     return engine.result(state, Outcome(residual[-1] < tolerance, tuple(residual), *seconds()))

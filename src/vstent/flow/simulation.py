@@ -18,7 +18,7 @@ from vstent.flow import sampling
 from vstent.flow.background import BackgroundWork
 from vstent.flow.case import FlowCase, FlowField, Level, Phase, Target
 from vstent.flow.domain import MIN_CELLS, CoarseGridError, default_cell_size_mm
-from vstent.flow.engines import AbstractEngine, Bookmark, DivergenceError, Progress, Saved, run
+from vstent.flow.engines import AbstractEngine, DivergenceError, Progress, Saved, run
 from vstent.flow.lattice.close_up import SHARE_AROUND, WIDTH, require_sac
 from vstent.flow.lattice.gpu import require_gpu
 from vstent.flow.problem import flow_case
@@ -234,25 +234,21 @@ class _Runs:
     ) -> FlowField:
         """Run an engine from a guess or a saved state; after divergence start again with the engine's calmer case."""
         engine = self.engine(size_mm, self.folder if name == "answer" else self.folder / name, outer)
-        guess, bookmark, checkpoint = cache(partial(_guessed, engine, case, guess)), None, self.checkpoint
-        if checkpoint is not None:
-            bookmark = Bookmark(checkpoint.load(name), lambda saved: checkpoint.save(name, saved))
+        guess, checkpoint = cache(partial(_guessed, engine, case, guess)), self.checkpoint
+        saved = None if checkpoint is None else checkpoint.load(name)
+        save = None if checkpoint is None else partial(checkpoint.save, name)
         progress = None if part is None else self._part(*part)
-
-        def attempt() -> FlowField:
-            first = None if bookmark is not None and bookmark.saved is not None else guess()
+        tries = 0
+        while True:
+            first = guess() if saved is None else None
             start = None if first is None else sampling.uniform(first)
-            return run(engine, case, start=start, progress=progress, bookmark=bookmark)
-
-        for _ in range(CALMER_TRIES):
             try:
-                return attempt()
+                return run(engine, case, start=start, progress=progress, saved=saved, save=save)
             except DivergenceError:
                 calmer = engine.calmer(case)
-                if calmer is None:
+                if calmer is None or tries == CALMER_TRIES:
                     raise
-                case, bookmark = calmer, None if bookmark is None else replace(bookmark, saved=None)
-        return attempt()
+                case, saved, tries = calmer, None, tries + 1
 
     def _part(self, begin: float, end: float) -> OnProgress | None:
         """Return a progress callback for one run among several, from `begin` to `end` of the whole."""

@@ -148,7 +148,7 @@ def test_a_guess_whose_grid_is_too_coarse_is_done_without(monkeypatch):
 def test_what_diverges_after_it_was_resumed_begins_anew_from_the_guess(monkeypatch):
     case, tried = case_of(cell_size_mm=0.1), []
 
-    def stub(engine, case, *, start, progress, bookmark):
+    def stub(engine, case, *, start, progress, saved, save):
         tried.append((engine.cell_size_mm, case.numerics.lattice_speed, start))
         if len(tried) == 1:
             raise DivergenceError("too fast")

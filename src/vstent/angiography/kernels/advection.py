@@ -109,14 +109,7 @@ def _limited(behind: Any, ahead: Any) -> Any:
 
 @njit(cache=True, parallel=True, nogil=True)
 def drift(mesh: Any, flux: Any, result: Any) -> None:
-    """Write the displacement (n, 3) of the blood of every cell along each axis, in cells per s.
-
-    Parameters
-    ----------
-    mesh : connections of the cells.
-    flux : (f,); flow rate to the upper side of every face, mm3/s.
-    result : (n, 3); set to the displacements.
-    """
+    """Write the displacement (n, 3) of the blood of every cell along each axis, in cells per s."""
     first, face, side, per_volume = mesh.first, mesh.face, mesh.side, mesh.per_volume
     for i in prange(len(per_volume)):
         result[i, :] = ZERO
@@ -247,18 +240,10 @@ def _settle(mesh: Any, groups: Any, held: Any, count: int, substep: int, base: f
 
 @njit(cache=True, nogil=True)
 def march(mesh: Any, groups: Any, held: Any, flux: Any, moves: Any, base: float, upper: Any, empty: Any) -> None:
-    """Advance the concentration by one step of the slowest level.
+    """Advance the concentration by one step of the slowest level, of 2^top base steps in s.
 
-    Parameters
-    ----------
-    mesh : connections of the cells.
-    groups : groups of cells.
-    held : concentration and masses; changed in place.
-    flux : (f,); flow rate to the upper side of every face, mm3/s; it balances in every cell.
-    moves : (n, 3); displacement of the blood, in cells per s (see `drift`).
-    base : base step, s.
-    upper : largest concentration of the inflow and of the cells.
-    empty : largest concentration in a group that is skipped.
+    The flow rates (f,) in mm3/s balance in every cell; `moves` (n, 3) is the displacement of the blood (see `drift`).
+    `upper` is the largest concentration of the inflow and of the cells, `empty` that of a group that is skipped.
     """
     top = len(groups.end) - 1
     held.state[:, TIME] = ZERO

@@ -15,7 +15,6 @@ from vstent.flow.openfoam.case import FoamCase
 from vstent.flow.openfoam.dictionary import vector
 from vstent.flow.openfoam.setup import FoamSetup
 from vstent.io.writers import write_text
-from vstent.kernels.arrays import Floats
 from vstent.units import M3_PER_ML, M_PER_MM
 
 KEY: Final = "vstent.key"
@@ -70,24 +69,22 @@ def mesh(found: program.Program, folder: Path, setup: FoamSetup) -> None:
 
 
 def begin_from(folder: Path, start: FlowField) -> None:
-    """Write a flow on any grid as the initial velocity and pressure of a meshed case."""
-    for part in list(folder.glob("processor[0-9]*")) or [folder]:
-        centers_mm = results.read_field(part, "0", "C").inside / M_PER_MM
-        velocity_m_s, pressure_Pa = sampling.values_at(start, centers_mm)
-        _put(part / "0" / "U", "vector", "(%.7g %.7g %.7g)", velocity_m_s)
-        _put(part / "0" / "p", "scalar", "%.7g", pressure_Pa[:, None] / start.blood.density_kg_m3)
-
-
-def _put(path: Path, kind: str, row: str, values: Floats) -> None:
-    """Replace the uniform internal value of a field by values (n, d).
+    """Write a flow on any grid as the initial velocity and pressure of a meshed case.
 
     The uniform values on faces between parts of the mesh are removed, so that OpenFOAM uses those of the adjacent
     cells. Kept, they would act as blood at rest there and block the flow.
     """
-    rows = "\n".join(row % tuple(value) for value in values)
-    head, _, tail = path.read_text().partition("internalField")
-    rest = BETWEEN_PARTS.sub(r"\1", tail.partition(";")[2])
-    write_text(path, f"{head}internalField nonuniform List<{kind}>\n{len(values)}\n(\n{rows}\n)\n;{rest}")
+    for part in list(folder.glob("processor[0-9]*")) or [folder]:
+        velocity_m_s, pressure_Pa = sampling.values_at(start, results.read_field(part, "0", "C").inside / M_PER_MM)
+        for name, kind, row, values in (
+            ("U", "vector", "(%.7g %.7g %.7g)", velocity_m_s),
+            ("p", "scalar", "%.7g", pressure_Pa[:, None] / start.blood.density_kg_m3),
+        ):
+            rows = "\n".join(row % tuple(value) for value in values)
+            head, _, tail = (part / "0" / name).read_text().partition("internalField")
+            rest = BETWEEN_PARTS.sub(r"\1", tail.partition(";")[2])
+            inside = f"internalField nonuniform List<{kind}>\n{len(values)}\n(\n{rows}\n)\n;"
+            write_text(part / "0" / name, f"{head}{inside}{rest}")
 
 
 def stop_at(folder: Path, end: float, *, every: int | None) -> None:

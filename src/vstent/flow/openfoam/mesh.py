@@ -1,7 +1,6 @@
 """OpenFOAM dictionaries of the mesh: a block of cubes, cut to the vessel by snappyHexMesh."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from math import ceil, log2
 from typing import Any
 
@@ -69,16 +68,6 @@ QUALITY = {
 """Quality limits; volumes and areas, in m3 and m2, suit cells of a few hundredths of a millimetre."""
 
 
-@dataclass(frozen=True)
-class _NarrowEnd:
-    """A narrow opening, whose cells are halved on one diameter of the vessel and in its extension."""
-
-    level: int
-    """Refinement level of its cells."""
-    cylinder: dict[str, Any]
-    """Entries of a cylinder around it."""
-
-
 def block_mesh(vertices_mm: Floats, cell_size_mm: float) -> str:
     """Return blockMeshDict: cubes `2**BASE_LEVEL` times the grid spacing, with a margin around the vertices (n, 3)."""
     size_mm = cell_size_mm * 2**BASE_LEVEL
@@ -103,11 +92,11 @@ def snappy(case: FlowCase, setup: FoamSetup, patches: Mapping[str, str], section
     narrow = _narrow_ends(case, setup, sections)
     has_neck, size_mm = case.ostium is not None, setup.cell_size_mm
     files = {LUMEN: {"regions": {name: {"name": name} for name in patches}}}
-    levels = {name: narrow[name].level if name in narrow else BASE_LEVEL for name in patches}
+    levels = dict.fromkeys(patches, BASE_LEVEL) | {name: level for name, (level, _) in narrow.items()}
     regions = {name: {"level": (levels[name],) * 2, "patchInfo": {"type": kind}} for name, kind in patches.items()}
     surfaces: dict[str, Any] = {LUMEN: {"level": (BASE_LEVEL, BASE_LEVEL), "regions": regions}}
     inside = {LUMEN: setup.dialect.refined_inside(BASE_LEVEL)}
-    inside |= {f"before_{name}": setup.dialect.refined_inside(end.level) for name, end in narrow.items()}
+    inside |= {f"before_{name}": setup.dialect.refined_inside(level) for name, (level, _) in narrow.items()}
     if has_neck:
         files[NECK] = {}
         inside[NECK] = {"mode": "distance", "levels": [(NECK_REACH * size_mm * M_PER_MM, BASE_LEVEL + 1)]}
@@ -115,7 +104,7 @@ def snappy(case: FlowCase, setup: FoamSetup, patches: Mapping[str, str], section
         files[STRUTS] = {"regions": {STRUTS: {"name": STRUTS}}}
         surfaces[STRUTS] = {"level": (BASE_LEVEL + setup.levels_at_struts,) * 2, "patchInfo": {"type": "wall"}}
     geometry = {name: {"type": "triSurfaceMesh", "file": f'"{name}.stl"', **more} for name, more in files.items()}
-    cylinders = {f"before_{name}": end.cylinder for name, end in narrow.items()}
+    cylinders = {f"before_{name}": cylinder for name, (_, cylinder) in narrow.items()}
     inlet = case.vessel.inlet
     # A point in the inlet's straight extension that is not on a plane of the background grid.
     point_mm = sections[0].mean(axis=0) - inlet.normal * 0.1137 * inlet.diameter_mm
@@ -150,8 +139,8 @@ def snappy(case: FlowCase, setup: FoamSetup, patches: Mapping[str, str], section
     return foam_file("snappyHexMeshDict", entries)
 
 
-def _narrow_ends(case: FlowCase, setup: FoamSetup, sections: Sequence[Floats]) -> dict[str, _NarrowEnd]:
-    """Return the openings with fewer than `CELLS_ACROSS_END` grid spacings across, by role."""
+def _narrow_ends(case: FlowCase, setup: FoamSetup, sections: Sequence[Floats]) -> dict[str, tuple[int, dict[str, Any]]]:
+    """Return level of refinement, and a cylinder one diameter long, at openings with less than `CELLS_ACROSS_END`."""
     narrow = {}
     for opening, section_mm in zip(case.vessel.openings, sections, strict=True):
         halvings = max(0, ceil(log2(CELLS_ACROSS_END * setup.cell_size_mm / opening.diameter_mm)))
@@ -165,7 +154,7 @@ def _narrow_ends(case: FlowCase, setup: FoamSetup, sections: Sequence[Floats]) -
             "point2": _metres(end_mm),
             "radius": 0.75 * opening.diameter_mm * M_PER_MM,
         }
-        narrow[opening.role] = _NarrowEnd(BASE_LEVEL + halvings, cylinder)
+        narrow[opening.role] = BASE_LEVEL + halvings, cylinder
     return narrow
 
 

@@ -28,12 +28,6 @@ class Program:
     bashrc: Path | None
     """File to source before running its programs; None where they are on the path."""
 
-    def command(self, *words: str) -> list[str]:
-        """Return the command line that runs one of its programs."""
-        if self.bashrc is None:
-            return list(words)
-        return ["bash", "-c", '. "$0" > /dev/null 2>&1; exec "$@"', str(self.bashrc), *words]
-
 
 def find() -> Program:
     """Find OpenFOAM on the path or in its install folders, the newest release of each kind of package first."""
@@ -60,12 +54,15 @@ def run(program: Program, folder: Path, words: list[str], *, processes: int = 1)
         environment.setdefault("WM_PROJECT_DIR", str(DEBIAN_FOLDER))
     if hasattr(os, "geteuid") and os.geteuid() == 0:  # in containers: Open MPI refuses root without both variables
         environment |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
+    command = list(words)
+    if program.bashrc is not None:
+        command = ["bash", "-c", '. "$0" > /dev/null 2>&1; exec "$@"', str(program.bashrc), *words]
     log = folder / f"log.{name}"
     before = log.stat().st_size if log.exists() else 0
     with log.open("ab") as output:
         try:
             done = subprocess.run(
-                program.command(*words),
+                command,
                 cwd=folder,
                 env=environment,
                 stdin=subprocess.DEVNULL,
