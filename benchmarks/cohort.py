@@ -20,9 +20,8 @@ from numpy.random import Generator
 
 from vstent import phantoms
 from vstent.cli import main
-from vstent.cohort.batch import collect, left_to_do, run_cohort
+from vstent.cohort.batch import COST, Row, collect, left_to_do, run_cohort
 from vstent.cohort.cases import Case, find_cases
-from vstent.cohort.work import COST, Row
 from vstent.io.writers import write_stl
 from vstent.phantoms import Phantom
 from vstent.study.workers import DaskCluster

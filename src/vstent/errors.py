@@ -42,13 +42,7 @@ class DeviceError(InputError):
 
 
 class LandingError(InputError):
-    """A landing zone that does not fit the artery.
-
-    Parameters
-    ----------
-    sentence : the message.
-    move_mm : distance along the artery by which to move the device, positive distally; 0 where that does not help.
-    """
+    """A landing zone that does not fit the artery."""
 
     def __init__(self, sentence: str, move_mm: float = 0.0) -> None:
         super().__init__(sentence)

@@ -164,42 +164,19 @@ class Option:
         return self.metavar or PLACEHOLDERS.get(self.read) or re.sub(r"[ /]", "_", self.limits.unit.upper()) or None
 
     def value(self, text: str) -> Any:
-        """Return a value read from the command line.
-
-        Raises
-        ------
-        InputError
-            The text is no value of this option.
-        """
+        """Return a value read from the command line; InputError where the text is no value of this option."""
         if self.choices and text not in self.choices:
             raise InputError(f"{text!r} is not one of {', '.join(self.choices)}")
         return self.check(self.read(text))
 
     def cell(self, text: str, folder: Path) -> Any:
-        """Return a value, or several, read from a cell of a table.
-
-        Parameters
-        ----------
-        text : content of the cell.
-        folder : folder of the table, to which paths are relative.
-
-        Raises
-        ------
-        InputError
-            The text is no value of this option.
-        """
+        """Return a value, or several, read from a cell of a table in a folder, to which paths are relative."""
         if self.separators:
             return tuple(self.value(part.strip()) for part in re.split(f"[{self.separators}]", text) if part.strip())
         return self.value(str(folder / text) if self.is_file and text != self.alone else text)
 
     def check(self, value: Any) -> Any:
-        """Return a value.
-
-        Raises
-        ------
-        InputError
-            A number is outside the limits, or there are too many or too few points.
-        """
+        """Return a value; InputError where a number is outside the limits, or there are too many or too few points."""
         if not isinstance(value, tuple | list):
             if isinstance(value, int | float):
                 self.limits.check(value)
@@ -229,12 +206,9 @@ def setting(
     usual: str = "",
     **more: Any,
 ) -> Any:
-    """Return a field of a data class with an option.
+    """Return a field of a data class with an immutable default and an option, of which these are the fields.
 
-    Parameters
-    ----------
-    default : default of the field, immutable.
-    name, text, read, limits, usual, more : fields of `Option`; `usual` is the default where that is a number or a word.
+    `usual` is the default where that is a number or a word.
     """
     is_said = isinstance(default, str | int | float) and not isinstance(default, bool)
     usual = usual or (f"{default:g}" if isinstance(default, int | float) else str(default)) if is_said else usual

@@ -4,6 +4,7 @@ A phantom is the union of round tubes around given axes and, optionally, an elli
 negative in the lumen, defines the surface, the scan and the true volumes.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
@@ -17,7 +18,7 @@ from vstent.geometry.image import Image
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Centerline
 from vstent.kernels import curves, smoothing, triangles
-from vstent.kernels.arrays import Floats, Ints, freeze
+from vstent.kernels.arrays import Floats, freeze
 from vstent.kernels.clipping import clip
 from vstent.kernels.isosurface import isosurface
 
@@ -55,9 +56,7 @@ class Sac:
         """Return the signed distance to the ellipsoid and its unit gradient.
 
         The distance is exact for a sphere and first-order accurate near the wall of an ellipsoid: k0 (k0 - 1) / k1 with
-        k0 = abs(x / r) and k1 = abs(x / r^2).
-
-        Shapes: `points_mm` (n, 3).
+        k0 = abs(x / r) and k1 = abs(x / r^2). Points are (n, 3).
         """
         local = points_mm - self.center_mm
         along = (local @ self.direction)[:, None] * self.direction
@@ -96,35 +95,28 @@ class Phantom:
         return (self.parent, *self.branches)
 
     def implicit_mm(self, points_mm: Floats) -> tuple[Floats, Floats]:
-        """Return the signed distance to the wall of the union and its unit gradient.
+        """Return the signed distance of points (n, 3) to the wall of the union and its unit gradient.
 
         Tubes are extended straight beyond their ends, except at an end inside the parent artery.
-
-        Shapes: `points_mm` (n, 3).
         """
         value, gradient = tube_implicit_mm(self.parent, points_mm)
-        parts = [tube_implicit_mm(branch, points_mm, begins_inside=self._feeds(branch)) for branch in self.branches]
+        parts = []
+        for branch in self.branches:
+            begins_inside = bool(tube_implicit_mm(self.parent, branch.points_mm[:1])[0][0] < 0)
+            parts.append(tube_implicit_mm(branch, points_mm, begins_inside=begins_inside))
         for part_value, part_gradient in [*parts, *(sac.implicit_mm(points_mm) for sac in self.sacs)]:
             nearer = part_value < value
             value, gradient = np.where(nearer, part_value, value), np.where(nearer[:, None], part_gradient, gradient)
         return value, gradient
 
-    def _feeds(self, branch: Centerline) -> bool:
-        """Return whether a branch begins inside the parent artery."""
-        return bool(tube_implicit_mm(self.parent, branch.points_mm[:1])[0][0] < 0)
-
     @cached_property
     def ends(self) -> tuple[tuple[Floats, Floats, float], ...]:
         """Center (3,), outward unit normal (3,) and radius of every opening: the inlet, then the end of every tube."""
-        inlet = (
-            self.parent.points_mm[0],
-            -curves.tangents(self.parent.points_mm[:3])[0],
-            self.parent.inscribed_radius_mm[0],
-        )
+        inlet, radius = self.parent.points_mm, self.parent.inscribed_radius_mm
         outlets = [
             (t.points_mm[-1], curves.tangents(t.points_mm[-3:])[-1], t.inscribed_radius_mm[-1]) for t in self.tubes
         ]
-        return (inlet, *outlets)
+        return ((inlet[0], -curves.tangents(inlet[:3])[0], radius[0]), *outlets)
 
     @cached_property
     def sac_volume_mm3(self) -> float:
@@ -138,13 +130,7 @@ class Phantom:
 
     @property
     def neck_center_mm(self) -> Floats:
-        """(3,) point of the parent artery's wall under the center of the sac.
-
-        Raises
-        ------
-        ValueError
-            The phantom has no sac.
-        """
+        """(3,) point of the parent artery's wall under the center of the sac; ValueError without a sac."""
         if self.sac is None:
             raise ValueError(f"phantom {self.name} has no sac")
         abscissa = self.parent.nearest_abscissa_mm(self.sac.center_mm[None])
@@ -172,11 +158,9 @@ class Phantom:
 
 
 def tube_implicit_mm(tube: Centerline, points_mm: Floats, *, begins_inside: bool = False) -> tuple[Floats, Floats]:
-    """Return the distance to the wall of a tube and the direction from its axis.
+    """Return the distance of points (n, 3) to the wall of a tube and the direction from its axis.
 
     The distance is that to the axis minus the radius at the nearest point of the axis. The ends are extended straight.
-
-    Shapes: `points_mm` (n, 3).
     """
     points, radius = tube.points_mm, tube.inscribed_radius_mm
     reach = np.linspace(4.0, 0.0, 40, endpoint=False)[:, None] * radius.max()
@@ -194,14 +178,7 @@ def tube_implicit_mm(tube: Centerline, points_mm: Floats, *, begins_inside: bool
 
 
 def tube(*, length_mm: float = 20.0, radius_mm: float = 2.0, end_radius_mm: float | None = None) -> Phantom:
-    """Return a straight tube along z.
-
-    Parameters
-    ----------
-    length_mm : its length.
-    radius_mm : its radius, at the inlet if it is tapered.
-    end_radius_mm : radius at the outlet of a linearly tapered tube; None: not tapered.
-    """
+    """Return a straight tube along z; with a radius at its outlet it is linearly tapered."""
     z = np.linspace(0.0, length_mm, int(length_mm / AXIS_STEP_MM) + 1)
     points = np.stack([np.zeros_like(z), np.zeros_like(z), z], axis=-1)
     end = radius_mm if end_radius_mm is None else end_radius_mm
@@ -218,9 +195,7 @@ def torus_arc(*, bend_radius_mm: float = 8.0, angle_rad: float = np.pi, radius_m
 def siphon(*, inlet_radius_mm: float = 2.1, outlet_radius_mm: float = 1.8) -> Phantom:
     """Return a curved internal carotid artery: up, forward, back over itself and up again (a C-shaped siphon).
 
-    Parameters
-    ----------
-    inlet_radius_mm, outlet_radius_mm : radii at the ends; the radius changes linearly along the axis.
+    The radius changes linearly along the axis.
     """
     knots = [
         (0.0, 5.0, 0.0), (0.0, 5.0, 4.0), (0.0, 4.6, 8.0), (0.2, 1.5, 11.6), (0.8, -3.2, 12.6), (1.4, -7.2, 14.0),
@@ -233,11 +208,7 @@ def siphon(*, inlet_radius_mm: float = 2.1, outlet_radius_mm: float = 1.8) -> Ph
 def bifurcation(*, radius_mm: float = 1.75, daughter_radius_mm: float = 1.5, half_angle_rad: float = 0.9) -> Phantom:
     """Return a bifurcation in the x-z plane: an artery along z with two daughters of bend radius 5 mm.
 
-    Parameters
-    ----------
-    radius_mm : radius of the parent artery.
-    daughter_radius_mm : radius of both daughters.
-    half_angle_rad : angle between each daughter and the z axis.
+    The half angle is that between each daughter and the z axis.
     """
     trunk_mm, bend_mm, leg_mm = 10.0, 5.0 * half_angle_rad, 9.0
     abscissa = np.linspace(0.0, trunk_mm + bend_mm + leg_mm, int((trunk_mm + bend_mm + leg_mm) / AXIS_STEP_MM) + 1)
@@ -261,10 +232,7 @@ def with_sac(
     elongation: float = 1.0,
     direction: Floats | None = None,
 ) -> Phantom:
-    """Return a phantom with a sac on the wall of the parent artery.
-
-    Shapes: `direction` (3,).
-    """
+    """Return a phantom with a sac on the wall of the parent artery, on the outer bend or in a direction (3,)."""
     parent = phantom.parent
     i = int(np.abs(parent.abscissa_mm - abscissa_mm).argmin())
     tangent = curves.tangents(parent.points_mm)[i]
@@ -278,15 +246,7 @@ def with_sac(
 
 
 def with_bleb(phantom: Phantom, *, direction: Floats, radius_mm: float = 1.2) -> Phantom:
-    """Return a phantom with a round daughter sac, half of which protrudes from the sac.
-
-    Shapes: `direction` (3,).
-
-    Raises
-    ------
-    ValueError
-        The phantom has no sac.
-    """
+    """Return a phantom with a round daughter sac, half of which protrudes from its sac in a direction (3,)."""
     if phantom.sac is None:
         raise ValueError(f"phantom {phantom.name} has no sac")
     unit = np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
@@ -298,10 +258,7 @@ def with_bleb(phantom: Phantom, *, direction: Floats, radius_mm: float = 1.2) ->
 def with_branch(
     phantom: Phantom, *, abscissa_mm: float, direction: Floats, radius_mm: float = 0.65, length_mm: float = 12.0
 ) -> Phantom:
-    """Return a phantom with a straight side branch.
-
-    Shapes: `direction` (3,).
-    """
+    """Return a phantom with a straight side branch in a direction (3,)."""
     start = phantom.parent.at(np.array([abscissa_mm]))[0]
     unit = np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
     points = start + np.linspace(0.0, length_mm, int(length_mm / AXIS_STEP_MM) + 1)[:, None] * unit
@@ -316,13 +273,7 @@ def demo_phantom() -> Phantom:
 
 
 def spline(knots_mm: Floats, *, vertical_ends: bool = False) -> Floats:
-    """Return a smooth curve (n, 3) through knots (k, 3), sampled every `AXIS_STEP_MM`.
-
-    Parameters
-    ----------
-    knots_mm : (k, 3) points on the curve.
-    vertical_ends : whether the curve begins and ends along z.
-    """
+    """Return a smooth curve (n, 3) through knots (k, 3), sampled every `AXIS_STEP_MM`; vertical ends are along z."""
     chord = curves.arc_length(knots_mm)
     up = np.array([0.0, 0.0, 1.0])
     fine = CubicSpline(chord, knots_mm, bc_type=((1, up), (1, up)) if vertical_ends else "natural")
@@ -351,17 +302,23 @@ def phantom_surface(phantom: Phantom, *, edge_mm: float = 0.25) -> Surface:
     # Values next to the wall are moved away from 0 to avoid slivers; the vertices are put on the wall afterwards.
     field = np.where(np.abs(field) < 0.2 * edge_mm, np.copysign(0.2 * edge_mm, field), field)
     index, faces = isosurface(-field.astype(np.float32), 0.0)
-    surface = _relaxed(phantom, low + edge_mm * index, faces)
-    return _cut_ends(phantom, surface, edge_mm)
-
-
-def _relaxed(phantom: Phantom, vertices: Floats, faces: Ints) -> Surface:
-    """Return a mesh with evenly distributed vertices on the wall."""
-    vertices = _onto_wall(phantom, vertices)
+    vertices = _onto_wall(phantom, low + edge_mm * index)
     mean = smoothing.averaging(len(vertices), faces)
-    for _ in range(5):
+    for _ in range(5):  # an even distribution
         vertices = _onto_wall(phantom, 0.5 * (vertices + mean @ vertices), steps=1)
-    return Surface(_onto_wall(phantom, vertices), faces)
+    vertices = _onto_wall(phantom, vertices)
+    for normal, radius, height, across in _from_ends(phantom, vertices):  # vertices near an end are moved onto it
+        near = (across < 1.5 * radius) & (np.abs(height) < 0.3 * edge_mm)
+        vertices[near] -= height[near, None] * normal
+    beyond = np.full(len(vertices), -1e6)
+    for _, radius, height, across in _from_ends(phantom, vertices):
+        near = (across < 1.5 * radius) & (height > -radius)
+        beyond = np.where(near, np.maximum(beyond, height), beyond)
+    beyond[np.abs(beyond) < 1e-6] = 0.0
+    vertices, faces = triangles.compact(*clip(vertices, faces, beyond))
+    rim = np.unique(triangles.open_edges(faces))
+    vertices[rim] = _onto_wall(phantom, vertices[rim])  # at the end of a round tube they stay in the plane
+    return Surface(vertices, faces)
 
 
 def _onto_wall(phantom: Phantom, points: Floats, *, steps: int = 3) -> Floats:
@@ -372,33 +329,12 @@ def _onto_wall(phantom: Phantom, points: Floats, *, steps: int = 3) -> Floats:
     return points
 
 
-def _beyond_ends(phantom: Phantom, points: Floats) -> Floats:
-    """Return the distance (n,) of points beyond the plane of a nearby end; far below 0 away from all ends."""
-    beyond = np.full(len(points), -1e6)
+def _from_ends(phantom: Phantom, points: Floats) -> Iterator[tuple[Floats, float, Floats, Floats]]:
+    """Yield normal and radius of every end, and the distances (n,) of points beyond its plane and from its axis."""
     for center, normal, radius in phantom.ends:
         local = points - center
         height = local @ normal
-        across = np.linalg.norm(local - height[:, None] * normal, axis=1)
-        near = (across < 1.5 * radius) & (height > -radius)
-        beyond = np.where(near, np.maximum(beyond, height), beyond)
-    return beyond
-
-
-def _cut_ends(phantom: Phantom, surface: Surface, edge_mm: float) -> Surface:
-    """Return the mesh cut at the end planes; vertices near a plane are moved onto it."""
-    vertices, faces = np.array(surface.vertices_mm), surface.faces
-    for center, normal, radius in phantom.ends:
-        local = vertices - center
-        height = local @ normal
-        across = np.linalg.norm(local - height[:, None] * normal, axis=1)
-        near = (across < 1.5 * radius) & (np.abs(height) < 0.3 * edge_mm)
-        vertices[near] -= height[near, None] * normal
-    beyond = _beyond_ends(phantom, vertices)
-    beyond[np.abs(beyond) < 1e-6] = 0.0
-    vertices, faces = triangles.compact(*clip(vertices, faces, beyond))
-    rim = np.unique(triangles.open_edges(faces))
-    vertices[rim] = _onto_wall(phantom, vertices[rim])  # at the end of a round tube they stay in the plane
-    return Surface(vertices, faces)
+        yield normal, radius, height, np.linalg.norm(local - height[:, None] * normal, axis=1)
 
 
 def _sample(phantom: Phantom, ticks: list[Floats], band_mm: float) -> Floats:
@@ -459,25 +395,26 @@ class Scanner:
 
 
 def scan(phantom: Phantom, rng: Generator, *, scanner: Scanner = Scanner()) -> Image:
-    """Return a synthetic 3DRA scan with partial volume, point spread, tissue and noise.
+    """Return a synthetic 3DRA scan with partial volume, point spread, tissue and noise of a random generator.
 
     The voxels are int16, the grid is aligned with LPS, and the vessel ends leave through the border.
-
-    Parameters
-    ----------
-    phantom : the phantom.
-    rng : source of noise and tissue structure.
-    scanner : voxel size, blur, noise and intensities.
     """
     h = scanner.voxel_mm
-    low, high = _field_of_view(phantom, scanner.margin_mm)
+    low, high = _box(phantom, margin_mm=scanner.margin_mm)
+    for center, normal, _ in phantom.ends:  # the box is cut there along the axis closest to the normal
+        axis = int(np.argmax(np.abs(normal)))
+        if normal[axis] > 0:
+            high[axis] = min(high[axis], center[axis])
+        else:
+            low[axis] = max(low[axis], center[axis])
     pad = int(np.ceil(4 * scanner.blur_mm / h))
     ticks = [np.arange(a + h / 2 - pad * h, b + pad * h, h) for a, b in zip(low, high, strict=True)]
     field = _sample(phantom, ticks, band_mm=3 * h)  # the gradient of a voxel near the wall reaches one voxel farther
     filled = gaussian_filter(_coverage(field, h).astype(np.float32), scanner.blur_mm / h)
-    tissue = _normalised(gaussian_filter(rng.standard_normal(field.shape, dtype=np.float32), 3.0 / h))
-    grain = _normalised(gaussian_filter(rng.standard_normal(field.shape, dtype=np.float32), 0.5))
-    voxels = filled + scanner.structure * tissue * (1 - filled) + scanner.noise * grain
+    tissue, grain = (
+        gaussian_filter(rng.standard_normal(field.shape, dtype=np.float32), blur) for blur in (3.0 / h, 0.5)
+    )
+    voxels = filled + scanner.structure * (tissue / tissue.std()) * (1 - filled) + scanner.noise * (grain / grain.std())
     inner = tuple(slice(pad, n - pad) for n in field.shape)
     affine = np.diag([h, h, h, 1.0])
     affine[:3, 3] = [t[pad] for t in ticks]
@@ -497,20 +434,3 @@ def _coverage(field: Floats, h: float) -> Floats:
     coverage = (field < 0).astype(np.float64)
     coverage[near] = filled / len(offsets)
     return coverage
-
-
-def _normalised(noise: Floats) -> Floats:
-    """Return noise scaled to a standard deviation of 1."""
-    return noise / noise.std()
-
-
-def _field_of_view(phantom: Phantom, margin_mm: float) -> tuple[Floats, Floats]:
-    """Return the corners of a box around the phantom, cut at the ends along the axis closest to each end's normal."""
-    low, high = _box(phantom, margin_mm=margin_mm)
-    for center, normal, _ in phantom.ends:
-        axis = int(np.argmax(np.abs(normal)))
-        if normal[axis] > 0:
-            high[axis] = min(high[axis], center[axis])
-        else:
-            low[axis] = max(low[axis], center[axis])
-    return low, high

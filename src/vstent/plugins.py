@@ -35,13 +35,7 @@ def plugins(group: Group) -> dict[str, EntryPoint]:
 
 
 def load(group: Group, name: str, *, built_in: str) -> Any:
-    """Load a plug-in by its name.
-
-    Parameters
-    ----------
-    group : entry point group.
-    name : which entry point of the group.
-    built_in : built-in choices that the error message lists.
+    """Load a plug-in of a group by its name; an error lists the built-in choices too.
 
     Raises
     ------

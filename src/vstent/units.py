@@ -16,14 +16,7 @@ MM_PER: Final = {"m": 1e3, "cm": 10.0, "mm": 1.0}
 
 
 def counted(n: int, one: str, many: str = "") -> str:
-    """Return a count with the word for what is counted: ``1 hole``, ``2 holes``.
-
-    Parameters
-    ----------
-    n : the count.
-    one : singular.
-    many : plural; empty: `one` + s.
-    """
+    """Return a count with the word for what is counted: ``1 hole``, ``2 holes``; an empty plural is `one` + s."""
     return f"{n} {one if n == 1 else many or one + 's'}"
 
 

@@ -300,3 +300,12 @@ def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
         main(["--version"])
     assert stopped.value.code == 0
     assert capsys.readouterr().out == f"vstent {version('vstent')}\n"
+
+
+@pytest.mark.parametrize("closed", ["2>&-", ">&- 2>&-", "<&- >&- 2>&-"])
+@pytest.mark.parametrize(("words", "code"), [("run none.stl --out out", 2), ("devices", 0)])
+def test_closed_streams_end_in_no_traceback(words: str, code: int, closed: str, tmp_path: Path) -> None:
+    command = f"exec {sys.executable} -X dev -m vstent {words} {closed}"
+    done = subprocess.run(["sh", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (code, "")
+    assert bool(done.stdout) == (code == 0 and closed == "2>&-")

@@ -16,6 +16,7 @@ from vstent.geometry.surface import Surface
 from vstent.io.surfaces import read_surface
 from vstent.io.vtk_reader import read_mesh
 from vstent.io.writers import write_stl
+from vstent.study.folder import CACHE
 from vstent.study.pipeline import run
 from vstent.study.settings import InputSettings, Settings
 
@@ -57,6 +58,20 @@ def test_a_case_of_an_older_version_is_refused_and_nothing_of_it_is_touched(
     )
     assert {file: file.read_bytes() for file in old.rglob("*") if file.is_file()} == before
     assert not (tmp_path / "patches").exists()
+
+
+def test_the_vessel_exported_is_that_of_the_run(
+    studied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    case = shutil.copytree(studied, tmp_path / "case")
+    (stored,) = (case / CACHE).glob("anatomy-*.npz")
+    for key in (12 * "0", 12 * "f"):
+        stored.with_name(f"anatomy-{key}-{key}.npz").write_text("another")
+    assert main(["export", "patches", str(case), "--out", str(tmp_path / "patches")]) == 0
+    stored.unlink()
+    assert main(["export", "patches", str(case), "--out", str(tmp_path / "other")]) == 2
+    assert "does not hold the artery of its run" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "other").exists()
 
 
 def test_patches_of_a_studied_case_are_watertight(studied: Path, tmp_path: Path) -> None:

@@ -21,18 +21,28 @@ from stated import NECK, STATED, needed
 from vstent import phantoms
 from vstent.cli import main
 from vstent.cohort import batch
-from vstent.cohort.batch import collect, left_to_do, run_cohort
+from vstent.cohort.batch import (
+    COST,
+    LOST,
+    collect,
+    flat_metrics,
+    left_to_do,
+    read_rows,
+    run_cohort,
+    work,
+)
 from vstent.cohort.cases import COLUMNS, find_cases
 from vstent.cohort.estimate import START_CPU_S, estimate
-from vstent.cohort.work import COST, LOST, flat_metrics, read_row, row_path, work
 from vstent.devices.treatment import with_device
 from vstent.errors import FlowError, InputError, ReadError, VstentError
 from vstent.flow.settings import FlowSettings
 from vstent.io.tables import write_parquet, write_rows
 from vstent.io.writers import write_stl
 from vstent.reporting.cohort import cohort_report, modified_z_scores
+from vstent.study.folder import CACHE
 from vstent.study.pipeline import run as run_study
 from vstent.study.settings import AnatomySettings, InputSettings, settings_of
+from vstent.study.store import Key, Store
 from vstent.study.workers import DaskCluster, Processes, Slurm
 
 TREATMENTS = (with_device("silk"), with_device("enterprise", center_mm=27.0))
@@ -71,6 +81,12 @@ def bare(rows):
     return [{key: value for key, value in row.items() if key not in COST} for row in rows]
 
 
+def stored_row(folder, treatment):
+    """The file with the row of a treatment in the folder of a case."""
+    (file,) = (folder / CACHE).glob(f"{treatment}-*.json")
+    return file
+
+
 def told(done, total, name, rows):
     pass
 
@@ -93,10 +109,9 @@ def test_the_table_has_a_row_a_case_and_device_with_every_metric_or_the_failure(
     assert [(row["case"], row["treatment"]) for row in table] == [(c, d) for c in "abc" for d in SETTINGS.devices]
     by_name = {(row["case"], row["treatment"]): row for row in table}
     study = run_study(scans / "a.stl", tmp_path / "a", SETTINGS, lambda *_: None)
-    metrics = json.loads((tmp_path / "a" / "metrics.json").read_text())
     for device in SETTINGS.devices:
         row = by_name["a", device]
-        wanted = json.loads(json.dumps(flat_metrics(metrics, device)))
+        wanted = json.loads(json.dumps(flat_metrics(study.metrics, device)))
         assert {key: row[key] for key in wanted} == wanted
         assert row["outcome"] == "done"
         assert row["sentence"] == study.implants[device][device].advice
@@ -116,7 +131,7 @@ def test_a_device_whose_flow_fails_leaves_the_files_of_the_others(scans, tmp_pat
             raise FlowError("it diverged")
         return {}, {}
 
-    monkeypatch.setattr("vstent.study.pipeline.compute_flows", failing)
+    monkeypatch.setattr("vstent.study.stages.compute_flows", failing)
     (case, *_) = find_cases(scans, GIVEN)
     (task,) = left_to_do([case], tmp_path, keeps_files=True)
     work(task)
@@ -167,12 +182,10 @@ def test_a_second_run_does_only_what_is_missing(scans, table, tmp_path):
     for case in cases:
         for device, key in case.keys.items():
             row = next(row for row in table if (row["case"], row["treatment"]) == (case.name, device))
-            path = row_path(tmp_path / "cases" / case.name, device)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(json.dumps({"key": key, "row": row}))
+            Store(tmp_path / "cases" / case.name / CACHE).write(device, key, {}, values=row)
     assert left_to_do(cases, tmp_path) == []
     # one row damaged, one input changed, one more device: just these are missing
-    row_path(tmp_path / "cases" / "a", "silk").write_text('{"key": ')
+    stored_row(tmp_path / "cases" / "a", "silk").write_text('{"values": ')
     changed = [replace(case, path=scans / "a.stl") if case.name == "b" else case for case in cases]
     treatments = (*TREATMENTS, with_device("pipeline"))
     more = [replace(c, settings=replace(c.settings, treatments=treatments)) for c in changed]
@@ -300,7 +313,7 @@ def test_an_estimate_grows_with_cases_devices_and_flow_and_heeds_memory(scans, m
     assert all_three.cpu_s > 2 * one.cpu_s
     flowing = [replace(case, settings=replace(SETTINGS, flow=FlowSettings())) for case in cases]
     assert estimate(flowing, 2).cpu_s > 10 * all_three.cpu_s
-    monkeypatch.setattr(sys.modules["vstent.cohort.estimate"], "_free_memory_MB", lambda: 3.5 * one.memory_MB)
+    monkeypatch.setattr(sys.modules["vstent.cohort.estimate"], "free_memory_bytes", lambda: 3.5e6 * one.memory_MB)
     assert estimate(cases[:1], 8).jobs == 3
 
 
@@ -333,7 +346,7 @@ def test_a_dask_worker_killed_midway_gives_the_same_table_and_a_lost_scheduler_k
         # the scheduler itself is lost as soon as one case is done
         for device in SETTINGS.devices:
             for name in "bc":
-                row_path(tmp_path / "cases" / name, device).unlink()
+                stored_row(tmp_path / "cases" / name, device).unlink()
         tasks = left_to_do(cases, tmp_path)
         monkeypatch.setattr(batch, "work", held)
         with pytest.raises(VstentError, match="scheduler was lost"):
@@ -436,6 +449,7 @@ class Scheduler:
 
 
 def test_rows_of_another_key_are_not_believed(tmp_path):
-    row_path(tmp_path, "silk").write_text('{"key": "one", "row": {"outcome": "done"}}')
-    assert read_row(tmp_path, "silk", "one") == {"outcome": "done"}
-    assert read_row(tmp_path, "silk", "two") is None
+    key = Key(12 * "1", 12 * "a")
+    Store(tmp_path / CACHE).write("silk", key, {}, values={"outcome": "done"})
+    assert read_rows(tmp_path, {"silk": key, "leo": key}) == {"silk": {"outcome": "done"}}
+    assert read_rows(tmp_path, {"silk": key._replace(code=12 * "b")}) == {}

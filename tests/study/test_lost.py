@@ -148,6 +148,26 @@ def test_another_input_is_refused_unless_it_is_to_replace(
     assert held(out) == before
 
 
+def test_treatments_that_a_replacing_command_does_not_name_are_reported(
+    arteries: tuple[Path, Path], existing: dict[str, Path], tmp_path: Path
+) -> None:
+    out, told = tmp_path / "out", []
+
+    def removed(command: object, path: Path, settings: Settings) -> list[str]:
+        told.clear()
+        command(path, out, settings, lambda now: told.append((now.stage, now.detail)), replaces=True)
+        return [detail for stage, detail in told if stage == "stored results"]
+
+    shutil.copytree(existing["two devices"], out)
+    sentence = "removed, because this command does not name them: {}."
+    assert removed(run, arteries[0], of("silk", "enterprise")) == []
+    assert removed(run, arteries[0], of("silk", "pipeline")) == [sentence.format("enterprise")]
+    assert removed(restore_vessel, arteries[0], PLAIN) == []
+    assert removed(restore_vessel, arteries[1], PLAIN) == [sentence.format("pipeline, silk")]
+    assert not (out / "treatments").exists()
+    assert removed(run, arteries[1], PLAIN) == []
+
+
 def test_added_devices_are_what_they_are_in_a_folder_of_their_own(arteries: tuple[Path, Path], tmp_path: Path) -> None:
     out, anew = tmp_path / "out", tmp_path / "anew"
     run(arteries[0], out, of("silk", flow=FLOW), quiet)
@@ -188,7 +208,7 @@ def test_a_device_that_does_not_fit_is_a_row_with_its_reason(
     assert case.failures == {"silk": "not deployed: No size of Silk fits: choose another device."}
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["failures"] == case.failures
     assert case.notes[0] == f"silk: {case.failures['silk']}"
-    with pytest.raises(LandingError, match="No size of Silk"):
+    with pytest.raises(LandingError, match=r"^silk: No size of Silk"):
         run(arteries[0], tmp_path / "none", PLAIN, quiet)
     assert not (tmp_path / "none").exists()
 

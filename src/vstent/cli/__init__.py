@@ -11,34 +11,38 @@ from collections.abc import Sequence
 from io import TextIOWrapper
 from typing import Final
 
-from vstent.cli import angiogram, app, batch, demo, devices, export, flow, rank, restore, run, trace
+from vstent.cli import angiogram, app, batch, demo, devices, export, flow, rank, run, vessel
 from vstent.cli.interrupt import borne_interrupts
 from vstent.cli.options import EPILOG
 from vstent.errors import InputError, VstentError
 
-COMMANDS: Final = (run, app, trace, restore, rank, batch, flow, angiogram, export, demo, devices)
-"""Commands in the order of the help."""
+COMMANDS: Final = (run, app, vessel, rank, batch, flow, angiogram, export, demo, devices)
+"""Modules of the commands in the order of the help."""
 BAD_INPUT: Final = 2
 """Exit code where an input or option cannot be used."""
 FAILED: Final = 1
 """Exit code where a computation failed."""
 INTERRUPTED: Final = 130
 """Exit code after Ctrl-C."""
+OUT_OF_MEMORY: Final = (
+    "out of memory. Finished results are kept: use a machine with more memory, a part of the scan, or a wider grid "
+    "spacing (--grid-spacing)."
+)
+"""Message where the memory does not suffice."""
 HELPER: Final = (sys.executable, "-m", "vstent.cli.warm")
 """Command of a second process that compiles the kernels needed last while this process compiles those needed first."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
+    """Run the command line with arguments, or those of the process.
 
-    Parameters
-    ----------
-    argv : arguments; None: those of the process.
-
-    Returns exit code: 0 done, 1 failed, 2 input cannot be used, 130 interrupted.
+    The exit code is 0 where it is done, 1 failed, 2 input cannot be used, 130 interrupted.
     """
     # The linear systems are too small for several threads of the linear algebra library.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:  # closed, such as by 2>&-: a file opened later must not get its number
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # a redirect on Windows has few characters; others become question marks
             stream.reconfigure(errors="replace")
@@ -57,40 +61,26 @@ def _done(arguments: argparse.Namespace) -> int:
 
         with telling(_first_use, helper=HELPER):
             return int(arguments.command(arguments))
-    except InputError as error:
-        return _fail(str(error), BAD_INPUT)
     except VstentError as error:
-        return _fail(str(error), FAILED)
+        sentence, code = str(error), BAD_INPUT if isinstance(error, InputError) else FAILED
     except KeyboardInterrupt:
-        return _fail("stopped. Finished results are kept: give the same command again to resume.", INTERRUPTED)
+        sentence, code = "stopped. Finished results are kept: give the same command again to resume.", INTERRUPTED
     except MemoryError:
-        return _fail(
-            "out of memory. Finished results are kept: use a machine with more memory, a part of the scan, or a wider "
-            "grid spacing (--grid-spacing).",
-            FAILED,
-        )
+        sentence, code = OUT_OF_MEMORY, FAILED
     except OSError as error:
         where = f" ({error.filename})" if error.filename else ""
-        return _fail(f"{error.strerror or error}{where}. {_remedy(error)}", FAILED)
-
-
-def _remedy(error: OSError) -> str:
-    """Return what to do about an error of the operating system."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return "Finished results are kept: free disk space and give the same command again."
-    return "No half-written file is left: correct that and give the same command again."
+        remedy = "No half-written file is left: correct that and give the same command again."
+        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            remedy = "Finished results are kept: free disk space and give the same command again."
+        sentence, code = f"{error.strerror or error}{where}. {remedy}", FAILED
+    print(f"vstent: {sentence}", file=sys.stderr)
+    return code
 
 
 def _first_use() -> None:
     """Print a notice that the kernels are being compiled."""
     said = "first use of this version: compiling its kernels, which takes about half a minute once."
     print(f"vstent: {said}", file=sys.stderr, flush=True)
-
-
-def _fail(sentence: str, code: int) -> int:
-    """Print an error message and return the exit code."""
-    print(f"vstent: {sentence}", file=sys.stderr)
-    return code
 
 
 class _Version(argparse.Action):

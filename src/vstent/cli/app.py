@@ -30,7 +30,7 @@ def add(commands: options.Commands) -> None:
         "--host", default="127.0.0.1", help="address of the server (default: 127.0.0.1, this machine only)"
     )
     parser.add_argument("--port", type=_port, default=0, help="port of the server (default: a free one)")
-    parser.add_argument("--no-browser", action="store_true", help="print the address of the page without opening it")
+    options.add_flag(parser, "no-browser", "print the address of the page without opening it")
     parser.set_defaults(command=_app)
 
 
@@ -56,7 +56,10 @@ def _app(arguments: argparse.Namespace) -> int:
     workspace = Workspace(Cases(arguments.cases.resolve()))
     if arguments.input is not None:
         workspace.open(arguments.input.resolve())
-    listener = _listen(arguments.host, arguments.port)
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    listener.bind((arguments.host, arguments.port))
+    listener.listen(128)  # it listens already, so that the printed address answers at once
     port = listener.getsockname()[1]
     token = new_token()
     hosts = tuple(dict.fromkeys(f"{name}:{port}" for name in (arguments.host, "127.0.0.1", "localhost")))
@@ -68,12 +71,3 @@ def _app(arguments: argparse.Namespace) -> int:
         webbrowser.open(url)
     uvicorn.Server(config).run(sockets=[listener])
     return 0
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    """Return a socket that listens already, so that the printed address answers at once."""
-    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    listener.bind((host, port))
-    listener.listen(128)
-    return listener

@@ -18,6 +18,10 @@ from vstent.devices.treatment import BARE
 from vstent.flow.convergence import POSITIONS, Refinement, Scatter
 from vstent.geometry.vessel import Opening
 from vstent.plan.rank import Candidate, Ranking
+from vstent.reporting.definitions import INDICES_WITH_OCCLUSION
+from vstent.reporting.quality import qualities, unusable
+from vstent.reporting.quantities import ERRORS, flatten, format_change, format_value, opening_rows
+from vstent.reporting.uncertainty import ends, how_sure, intervals, number_name
 from vstent.study.progress import Progress
 
 ROWS: Final = (
@@ -79,7 +83,7 @@ class Console:
             self._status = None
 
     def progress(self, told: Progress) -> None:
-        """Show the progress of a stage."""
+        """Show the progress of a stage: on a terminal in the spinner, else a line every `QUIET_S`."""
         now, stage = time.monotonic(), told.stage
         began = self._began.setdefault(stage, now)
         if told.fraction >= 1.0:
@@ -115,27 +119,27 @@ def _state(told: Progress) -> str:
 
 def comparison_table(metrics: Mapping[str, Any]) -> Table:
     """Return the table of the main results: in the bare artery, and with each treatment and its relative change."""
-    treatments = _treatments(metrics)
+    treatments, bare = _treatments(metrics), _bare(metrics)
     table = Table("", BARE, *treatments)
     for title, key in DEVICE_ROWS:
-        cells = [" + ".join(_banded(key, one) for one in found["implants"].values()) for found in treatments.values()]
+        cells = [
+            " + ".join(
+                f"{_cell(key, implant.get(key))} {_spaced(ends(implant, key))}".rstrip()
+                for implant in treatment["implants"].values()
+            )
+            for treatment in treatments.values()
+        ]
         if any(cells):
             table.add_row(title, "", *cells)
-    if not _bare(metrics):
-        return table
-    table.add_section()
-    _add_grades(table, metrics)
-    for title, key in ROWS:
-        bare = _bare(metrics).get(key)
-        if bare is None:
-            continue
-        table.add_row(title, *_flow_cells(metrics, key, bare))
+    if bare:
+        table.add_section()
+        _add_flow_rows(table, metrics, {key: title for title, key in ROWS})
     return table
 
 
 def _treatments(metrics: Mapping[str, Any]) -> dict[str, Any]:
     """Return the metrics of all treatments with implants, by name."""
-    return {name: found for name, found in metrics["treatments"].items() if name != BARE}
+    return {name: treatment for name, treatment in metrics["treatments"].items() if name != BARE}
 
 
 def _bare(metrics: Mapping[str, Any]) -> dict[str, Any]:
@@ -143,17 +147,8 @@ def _bare(metrics: Mapping[str, Any]) -> dict[str, Any]:
     return dict(metrics["treatments"].get(BARE, {}).get("flow", {}))
 
 
-def _banded(key: str, implant: Mapping[str, Any]) -> str:
-    """Return a measure of an implant with its band."""
-    from vstent.reporting.uncertainty import ends
-
-    return f"{_cell(key, implant.get(key))} {_spaced(ends(implant, key))}".rstrip()
-
-
 def device_sentences(metrics: Mapping[str, Any]) -> list[str]:
     """Return how sure each device is, one text each, with the ranges of all its implants."""
-    from vstent.reporting.uncertainty import how_sure
-
     by_device: dict[str, dict[str, Any]] = {}
     for name, treatment in _treatments(metrics).items():
         for key, implant in treatment["implants"].items():
@@ -171,27 +166,26 @@ def device_sentences(metrics: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _add_grades(table: Table, metrics: Mapping[str, Any]) -> None:
-    """Add the grades of the flows as a row, and their reasons and the grid as the caption."""
-    from vstent.reporting.quality import qualities
+def _add_flow_rows(table: Table, metrics: Mapping[str, Any], titles: Mapping[str, str]) -> None:
+    """Add the grades of the flows and the indices with these keys and titles, each with its change where it is usable.
 
-    graded = {one.name: one for one in qualities(metrics, {name: name for name in _treatments(metrics)})}
+    The reasons of the grades and the grid are the caption.
+    """
+    treatments, bare = _treatments(metrics), _bare(metrics)
+    graded = {one.name: one for one in qualities(metrics, {name: name for name in treatments})}
     if graded:
-        cells = (graded[name].grade if name in graded else "" for name in (BARE, *_treatments(metrics)))
-        table.add_row("Grade of the flow", *cells)
+        table.add_row(
+            "Grade of the flow", *(graded[name].grade if name in graded else "" for name in (BARE, *treatments))
+        )
         reasons = (one.sentence for one in graded.values() if one.reasons)
         table.caption = "\n".join([f"Flow: {graded[BARE].computation}.", *reasons])
         table.caption_justify = "left"
-
-
-def _flow_cells(metrics: Mapping[str, Any], key: str, bare: float) -> list[str]:
-    """Return a row of a flow index: bare, and with each treatment and its change where that may be shown."""
-    from vstent.reporting.quality import unusable
-
     hidden = unusable(metrics)
-    values = {name: found.get("flow", {}).get(key) for name, found in _treatments(metrics).items()}
-    shown = (_cell(key, one) if name in hidden else _change(key, bare, one) for name, one in values.items())
-    return [_cell(key, bare), *shown]
+    for key, title in titles.items():
+        if key in bare:
+            values = {name: treatment.get("flow", {}).get(key) for name, treatment in treatments.items()}
+            shown = (_cell(key, x) if name in hidden else _change(key, bare[key], x) for name, x in values.items())
+            table.add_row(title, _cell(key, bare[key]), *shown)
 
 
 COHORT_COLUMNS: Final = (
@@ -223,15 +217,14 @@ FLOW_COLUMNS: Final = (
 
 def ranking_table(ranking: Ranking, shown: int) -> Table:
     """Return the table of the best candidates of a ranking."""
-    has_flow = any("flow_grade" in candidate.measures for candidate in ranking.candidates)
-    columns = RANKING_COLUMNS + tuple(
-        one for one in FLOW_COLUMNS * has_flow if any(one[1] in candidate.measures for candidate in ranking.candidates)
-    )
+    measured = {key for candidate in ranking.candidates for key in candidate.measures}
+    columns = RANKING_COLUMNS + tuple(column for column in FLOW_COLUMNS if column[1] in measured)
     table = Table("", "device and size", "shift", "score", *(title for title, _, _ in columns))
     for number, candidate in _shown(ranking, shown):
-        values = [(candidate.measures.get(key), form) for _, key, form in columns]
-        cells = ["" if value is None else form.format(value) for value, form in values]
-        cells[0] += _length_band(candidate.measures)
+        measures = candidate.measures
+        cells = ["" if measures.get(key) is None else form.format(measures[key]) for _, key, form in columns]
+        if "deployed_length_low_mm" in measures:
+            cells[0] += f" ({measures['deployed_length_low_mm']:.1f}-{measures['deployed_length_high_mm']:.1f})"
         score = f"{candidate.score:.2f}" if candidate.is_suitable else "out"
         table.add_row(str(number), candidate.label, f"{candidate.shift_mm:+g}", score, *cells)
     table.columns[1].no_wrap = True
@@ -242,17 +235,9 @@ def ranking_table(ranking: Ranking, shown: int) -> Table:
     return table
 
 
-def _length_band(measures: Mapping[str, Any]) -> str:
-    """Return the band of the deployed length in brackets; empty where there is none."""
-    if "deployed_length_low_mm" not in measures:
-        return ""
-    return f" ({measures['deployed_length_low_mm']:.1f}-{measures['deployed_length_high_mm']:.1f})"
-
-
 def ranking_reasons(ranking: Ranking, shown: int) -> str:
     """Return one line per candidate with the reasons for its rank."""
-    best = _shown(ranking, shown)
-    return "\n".join(f"{number}. {candidate.label}: {candidate.reason}" for number, candidate in best)
+    return "\n".join(f"{n}. {candidate.label}: {candidate.reason}" for n, candidate in _shown(ranking, shown))
 
 
 def _shown(ranking: Ranking, count: int) -> list[tuple[int, Candidate]]:
@@ -282,8 +267,6 @@ def cohort_table(rows: Sequence[Mapping[str, Any]]) -> Table:
 
 def uncertainty_table(metrics: Mapping[str, Any]) -> Table:
     """Return the table of uncertainty intervals of all results, with the main causes."""
-    from vstent.reporting.uncertainty import intervals
-
     table = Table("treatment", "result", "mean", "95 % interval from", "to", "main causes", title="uncertainty")
     for name, found in _treatments(metrics).items():
         for row in intervals(found):
@@ -294,8 +277,6 @@ def uncertainty_table(metrics: Mapping[str, Any]) -> Table:
 
 def opening_table(openings: Sequence[Opening]) -> Table:
     """Return the table of openings: role, diameter, area, center."""
-    from vstent.reporting.quantities import opening_rows
-
     table = Table("opening", "diameter", "area", "center (LPS)")
     for row in opening_rows(openings):
         table.add_row(*map(_spaced, row))
@@ -304,8 +285,6 @@ def opening_table(openings: Sequence[Opening]) -> Table:
 
 def morphology_table(measures: Mapping[str, Any]) -> Table:
     """Return the table of morphology: name and value with unit."""
-    from vstent.reporting.quantities import flatten
-
     table = Table("morphology", "")
     for quantity in flatten(measures):
         table.add_row(quantity.name, quantity.text)
@@ -314,59 +293,46 @@ def morphology_table(measures: Mapping[str, Any]) -> Table:
 
 def flow_table(metrics: Mapping[str, Any]) -> Table:
     """Return the table of all flow indices: bare, and with each treatment and its relative change."""
-    from vstent.reporting.quantities import flatten
-
     table = Table("flow", BARE, *_treatments(metrics))
-    _add_grades(table, metrics)
-    for quantity in flatten(_bare(metrics)):
-        table.add_row(quantity.name, *_flow_cells(metrics, quantity.key, quantity.value))
+    _add_flow_rows(table, metrics, {quantity.key: quantity.name for quantity in flatten(_bare(metrics))})
     return table
 
 
 def angiogram_table(metrics: Mapping[str, Any]) -> Table:
     """Return the table of angiograms: bare, and with each treatment and its relative change."""
-    from vstent.reporting.definitions import INDICES_WITH_OCCLUSION
-    from vstent.reporting.quantities import flatten
-
-    table, bare = Table("angiogram", BARE, *_treatments(metrics)), _bare(metrics)
-    _add_grades(table, metrics)
-    for key in CONTRAST_ROWS:
-        if key in bare:
-            name = flatten({key: 0.0})[0].name
-            table.add_row(name, *_flow_cells(metrics, key, bare[key]))
+    table = Table("angiogram", BARE, *_treatments(metrics))
+    _add_flow_rows(table, metrics, {key: _title(key) for key in CONTRAST_ROWS})
     table.caption = "\n".join([str(table.caption or ""), *INDICES_WITH_OCCLUSION]).strip()
     return table
 
 
 def convergence_table(found: Refinement) -> Table:
     """Return the table of one refinement: every quantity at three sizes, observed order and extrapolated value."""
-    from vstent.reporting.quantities import flatten
-
     columns = (f"{size:.3g}" for size in found.sizes)
     table = Table(found.name.replace("_", " "), *columns, "order", "limit", "±")
     for key, one in found.quantities.items():
         order = "not monotone" if one.order is None else f"{one.order:.1f}"
-        values = [quantity.text for value in one.values for quantity in flatten({key: value})]
-        name = flatten({key: 0.0})[0].name
-        table.add_row(name, *values, order, _cell(key, one.extrapolated), f"{one.uncertainty_fraction:.1%}")
+        *values, limit = (_cell(key, value) for value in (*one.values, one.extrapolated))
+        table.add_row(_title(key), *values, order, limit, f"{one.uncertainty_fraction:.1%}")
     return table
 
 
 def positions_table(found: Mapping[str, Scatter]) -> Table:
     """Return the table of one flow in several orientations on the grid: every quantity, its mean and half its range."""
-    from vstent.reporting.quantities import flatten
-
     table = Table("orientation on the grid", *POSITIONS, "mean", "±")
     for key, one in found.items():
-        values = [flatten({key: value})[0].text for value in (*one.values, one.mean)]
-        table.add_row(flatten({key: 0.0})[0].name, *values, f"{one.uncertainty_fraction:.1%}")
+        values = (_cell(key, value) for value in (*one.values, one.mean))
+        table.add_row(_title(key), *values, f"{one.uncertainty_fraction:.1%}")
     return table
+
+
+def _title(key: str) -> str:
+    """Return the name of a quantity."""
+    return flatten({key: 0.0})[0].name
 
 
 def _cell(key: str, value: Any) -> str:
     """Return a value with its unit; empty where there is none."""
-    from vstent.reporting.quantities import format_value
-
     return "" if value is None else _spaced(format_value(key, value))
 
 
@@ -377,8 +343,6 @@ def _spaced(text: str) -> str:
 
 def _change(key: str, bare: float, value: float | None) -> str:
     """Return a value with its unit and its change; empty where there is none."""
-    from vstent.reporting.quantities import ERRORS, format_change
-
     if value is None or key in ERRORS:
         return _cell(key, value)
     change = _spaced(format_change(bare, value, key)).replace(" %", "%").replace("−", "-")
@@ -416,9 +380,9 @@ def fit_table(fitted: Fitted) -> Table:
     for name, value, error, before, is_determined in zip(
         fitted.names, fitted.values, fitted.errors, fitted.prior_errors, fitted.is_determined, strict=True
     ):
-        form = _degrees if name.endswith("_rad") else _plain_number
-        unit = "°" if name.endswith("_rad") else "um" if name.endswith("_um") else "mm"
-        cells = (f"{form(one)} {unit}" for one in (value, error, before))
+        is_angle = name.endswith("_rad")
+        unit = "°" if is_angle else "um" if name.endswith("_um") else "mm"
+        cells = (f"{degrees(x):.2f} {unit}" if is_angle else f"{x:.3f} {unit}" for x in (value, error, before))
         table.add_row(_number_title(name), *cells, "yes" if is_determined else "no, as the similar device")
     residuals = fitted.residuals
     worst = int(abs(residuals).argmax())
@@ -438,20 +402,8 @@ def correlation_table(fitted: Fitted) -> Table:
     return table
 
 
-def _degrees(value: float) -> str:
-    """Return an angle in rad as degrees."""
-    return f"{degrees(value):.2f}"
-
-
-def _plain_number(value: float) -> str:
-    """Return a number with three decimals."""
-    return f"{value:.3f}"
-
-
 def _number_title(name: str) -> str:
     """Return the display name of a fitted number."""
-    from vstent.reporting.uncertainty import number_name
-
     base, _, label = name.partition(" ")
     if label:
         return f"{label} mm: length minus label"

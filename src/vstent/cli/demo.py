@@ -8,20 +8,12 @@ from vstent.cli import finished, options, run
 
 def add(commands: options.Commands) -> None:
     """Add the command."""
-    parser = options.add_command(
-        commands,
-        "demo",
-        "Run a study of a synthetic scan and compare it with the known truth.",
-        "demo --no-flow --out demo",
-    )
+    text = "Run a study of a synthetic scan and compare it with the known truth."
+    parser = options.add_command(commands, "demo", text, "demo --no-flow --out demo")
     parser.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help="case folder (default: demo)")
-    parser.add_argument(
-        "--replace",
-        action="store_true",
-        help="replace results in the folder that belong to other settings (default: refuse)",
-    )
+    options.add_flag(parser, "replace", "replace results in the folder that belong to other settings (default: refuse)")
     options.add_settings(parser, *options.STUDY)
-    run.add_pdf(parser)
+    options.add_flag(parser, "pdf", run.PDF)
     parser.set_defaults(command=_demo, answered=finished.answered)
 
 

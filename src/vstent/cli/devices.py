@@ -11,12 +11,8 @@ def add(commands: options.Commands) -> None:
     parser = options.add_command(commands, "devices", "List the devices of the catalogue, or add your own.", "devices")
     parser.set_defaults(command=_devices)
     commands_of_devices = parser.add_subparsers(metavar="COMMAND")
-    adding = options.add_command(
-        commands_of_devices,
-        "add",
-        "Add devices of your own to the catalogue.",
-        "devices add mine.toml",
-    )
+    text = "Add devices of your own to the catalogue."
+    adding = options.add_command(commands_of_devices, "add", text, "devices add mine.toml")
     adding.add_argument(
         "file", type=Path, help="TOML file in the form of vstent's catalogue.toml: every number with its source"
     )
@@ -37,8 +33,8 @@ def add(commands: options.Commands) -> None:
     fitting.add_argument(
         "--name", help="name of the device (default: that of the similar device, followed by measured)"
     )
-    fitting.add_argument("--all-sizes", action="store_true", help="offer the device in all sizes of the similar one")
-    fitting.add_argument("--template", action="store_true", help="print an example of the CSV file")
+    options.add_flag(fitting, "all-sizes", "offer the device in all sizes of the similar one")
+    options.add_flag(fitting, "template", "print an example of the CSV file")
     fitting.set_defaults(command=_fit)
 
 

@@ -8,10 +8,10 @@ command prints that again. This needs no import of the computations, which takes
 import argparse
 import os
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from vstent.io.states import State, program_states, state_of
 from vstent.study.folder import CACHE, LOCK
@@ -27,13 +27,8 @@ OF_CATALOGUE: Final = ("HOME", "XDG_CONFIG_HOME", "APPDATA")
 """Environment variables that say where the user's devices are."""
 
 
-class Begun(NamedTuple):
-    """What the output of a command depends on, as it was before the command ran."""
-
-    command: Key
-    """Arguments and terminal, and the program."""
-    states: dict[str, State]
-    """States of the input, of files given as options, and of the user's devices, by path."""
+Begun = tuple[Key, dict[str, State]]
+"""What the output of a command depends on, as it was before the command ran: its key; states of files by path."""
 
 
 def answered(arguments: argparse.Namespace) -> bool:
@@ -50,18 +45,29 @@ def answered(arguments: argparse.Namespace) -> bool:
 
 
 def begun(arguments: argparse.Namespace, source: Path) -> Begun:
-    """Return what the output of a command depends on, before the command runs.
+    """Return what the output of a command on a scan or surface depends on, before the command runs.
 
-    Parameters
-    ----------
-    arguments : parsed options.
-    source : the scan or surface.
+    The states are those of the input, of files given as options, and of the user's devices. Those of folders too, to
+    which further files might be added.
     """
     from vstent.devices.catalogue import user_folder
+    from vstent.errors import VstentError
+    from vstent.io.dicom import is_dicom
+    from vstent.io.images import files_of
 
     devices = user_folder()
-    found = {*_inputs(source), *_files_in(vars(arguments).values()), devices, *devices.glob("*.toml")}
-    return Begun(_command(arguments), _states(found))
+    files = {source, devices, *devices.glob("*.toml")}
+    with suppress(OSError, VstentError):  # the study states what is wrong with an input
+        if source.is_dir():
+            files |= {*source.rglob("*")}
+        else:
+            files |= {*files_of(source), *([source.parent] if is_dicom(source) else [])}
+    for value in vars(arguments).values():
+        for item in value if isinstance(value, (list, tuple)) else [value]:
+            with suppress(OSError, ValueError):
+                if isinstance(item, (str, Path)) and Path(item).is_file():
+                    files.add(Path(item))
+    return _command(arguments), _states(files)
 
 
 def remember(arguments: argparse.Namespace, before: Begun, told: Mapping[str, Any], printed: str) -> None:
@@ -82,21 +88,8 @@ def remember(arguments: argparse.Namespace, before: Begun, told: Mapping[str, An
         if is_of_another(arguments.out, told):
             return
         own = {file for file in arguments.out.rglob("*") if file.is_file() and not file.name.startswith((RECORD, LOCK))}
-        files = _states(own) | before.states
-        Store(arguments.out / CACHE).write(RECORD, before.command, {}, files=files, printed=printed)
-
-
-def _inputs(source: Path) -> set[Path]:
-    """Return the files of the input, and the folders to which further ones might be added."""
-    from vstent.errors import VstentError
-    from vstent.io.dicom import is_dicom
-    from vstent.io.images import files_of
-
-    with suppress(OSError, VstentError):  # the study states what is wrong with an input
-        if source.is_dir():
-            return {source, *source.rglob("*")}
-        return {*files_of(source), *([source.parent] if is_dicom(source) else [])}
-    return {source}
+        command, states = before
+        Store(arguments.out / CACHE).write(RECORD, command, {}, files=_states(own) | states, printed=printed)
 
 
 def _states(files: Iterable[Path]) -> dict[str, State]:
@@ -107,27 +100,10 @@ def _states(files: Iterable[Path]) -> dict[str, State]:
 def _command(arguments: argparse.Namespace) -> Key:
     """Return the key of everything but files that the output of a command depends on."""
     given = {name: str(value) for name, value in vars(arguments).items() if not callable(value)}
-    packages = [place for place in sys.path if place.endswith("-packages")]
-    programs: dict[str, State] = program_states() | {place: state_of(Path(place)) for place in packages}
-    catalogue = [os.environ.get(name) for name in OF_CATALOGUE]
-    return Key(digest([given, os.getcwd(), _terminal(), catalogue]), digest([programs, sys.version]))
-
-
-def _terminal() -> list[Any]:
-    """Return the properties of the terminal that change how tables are printed."""
-    sizes: list[Any] = [os.environ.get(name) for name in OF_TERMINAL]
+    surroundings: list[Any] = [os.environ.get(name) for name in (*OF_TERMINAL, *OF_CATALOGUE)]
     for number in (0, 1, 2):
         with suppress(OSError):
-            sizes.append([number, os.get_terminal_size(number).columns])
-    return [*sizes, sys.stdout.isatty()]
-
-
-def _files_in(values: Iterable[Any]) -> Iterator[Path]:
-    """Yield the files that values, or the items of lists and tuples among them, name."""
-    for value in values:
-        if isinstance(value, (list, tuple)):
-            yield from _files_in(value)
-        elif isinstance(value, (str, Path)):
-            with suppress(OSError, ValueError):
-                if Path(value).is_file():
-                    yield Path(value)
+            surroundings.append([number, os.get_terminal_size(number).columns])
+    packages = {place: state_of(Path(place)) for place in sys.path if place.endswith("-packages")}
+    programs: dict[str, State] = program_states() | packages
+    return Key(digest([given, os.getcwd(), surroundings, sys.stdout.isatty()]), digest([programs, sys.version]))

@@ -33,30 +33,23 @@ def borne_interrupts() -> Iterator[None]:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt, or defer it where it is not safe."""
-    if not _is_borne(frame):
-        again = threading.Timer(AGAIN_S, _again)
-        again.daemon = True
-        again.start()
-        return
-    raise KeyboardInterrupt
-
-
-def _is_borne(frame: FrameType | None) -> bool:
-    """Return whether no frame on the call stack belongs to a package that must not be interrupted."""
+    """Raise KeyboardInterrupt, or defer it where a frame belongs to a package that must not be interrupted."""
     while frame is not None:
         name = str(frame.f_globals.get("__name__"))
         if name.partition(".")[0] in UNBEARING and not name.startswith(BEARING):
-            return False
+            timer = threading.Timer(AGAIN_S, _again)
+            timer.daemon = True
+            timer.start()
+            return
         frame = frame.f_back
-    return True
+    raise KeyboardInterrupt
 
 
 def _again() -> None:
     """Interrupt the main thread again, unless this handler is no longer installed."""
+    main = threading.main_thread().ident
     if signal.getsignal(signal.SIGINT) is not _interrupt:
         return
-    main = threading.main_thread().ident
     if hasattr(signal, "pthread_kill") and main is not None:
         signal.pthread_kill(main, signal.SIGINT)
     else:  # Windows

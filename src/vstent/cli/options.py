@@ -3,7 +3,7 @@
 import argparse
 import os
 import re
-from collections.abc import Callable, Container
+from collections.abc import Container
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
@@ -25,18 +25,6 @@ Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 """Parser to which every command adds itself."""
 
 
-def readable(option: fields.Option) -> Callable[[str], Any]:
-    """Return a function that reads a value of an option as argparse requires it."""
-
-    def read(text: str) -> Any:
-        try:
-            return option.value(text)
-        except InputError as error:
-            raise argparse.ArgumentTypeError(str(error)) from None
-
-    return read
-
-
 def add_option(group: "argparse._ActionsContainer", option: fields.Option, **more: Any) -> None:
     """Add an option, and the one that states its opposite."""
     about = f"{option.help}, {option.limits.unit}" if option.limits.unit else option.help
@@ -45,15 +33,19 @@ def add_option(group: "argparse._ActionsContainer", option: fields.Option, **mor
     names = [*([option.short] if option.short else []), f"--{option.name}"]
     if option.off[0]:
         group = group.add_mutually_exclusive_group()
-        group.add_argument(f"--{option.off[0]}", action="store_true", help=option.off[1])
+        add_flag(group, *option.off)
     if option.read is fields.flag:
         group.add_argument(*names, action="store_true", default=None, help=about, **more)
         return
-    kind: dict[str, Any] = {"type": readable(option), "help": about}
-    if option.choices:
-        kind["choices"] = option.choices
-    else:
-        kind["metavar"] = option.placeholder
+
+    def read(text: str) -> Any:
+        try:
+            return option.value(text)
+        except InputError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    kind: dict[str, Any] = {"type": read, "help": about}
+    kind |= {"choices": option.choices} if option.choices else {"metavar": option.placeholder}
     if option.separators:
         kind["action"] = "append"
     if option.alone:
@@ -66,6 +58,11 @@ def add_number(
 ) -> None:
     """Add an option that is a number, with its default."""
     add_option(group, fields.Option(name, text, limits=limits, usual=f"{default:g}"), default=default)
+
+
+def add_flag(group: "argparse._ActionsContainer", name: str, text: str) -> None:
+    """Add an option without a value."""
+    group.add_argument(f"--{name}", action="store_true", help=text)
 
 
 def add_settings(parser: argparse.ArgumentParser, *sections: str, without: Container[str] = ()) -> None:
@@ -115,10 +112,10 @@ def add_case(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="case folder; a folder that exists is continued"
     )
-    parser.add_argument(
-        "--replace",
-        action="store_true",
-        help="replace results in the case folder that belong to another input or other settings (default: refuse)",
+    add_flag(
+        parser,
+        "replace",
+        "replace results in the case folder that belong to another input or other settings (default: refuse)",
     )
 
 
@@ -128,19 +125,11 @@ def add_workers(group: "argparse._ArgumentGroup") -> None:
     add_option(group, jobs, default=cores())
     workers = group.add_mutually_exclusive_group()
     workers.add_argument("--scheduler", metavar="ADDRESS", help="use the workers of this Dask scheduler")
-    workers.add_argument(
-        "--slurm", action="store_true", help="use --jobs jobs of a Slurm queue (needs the extra cluster)"
-    )
+    add_flag(workers, "slurm", "use --jobs jobs of a Slurm queue (needs the extra cluster)")
 
 
 def given_workers(arguments: argparse.Namespace, jobs: int, memory_MB: float) -> "AbstractWorkers":
-    """Return the processes or the cluster that the options request.
-
-    Raises
-    ------
-    InputError
-        A Slurm job is requested whose memory is unknown.
-    """
+    """Return the processes or the cluster that the options request; InputError for Slurm jobs of unknown memory."""
     from vstent.study.workers import DaskCluster, Processes, Slurm
 
     if arguments.scheduler:

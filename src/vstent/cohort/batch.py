@@ -1,45 +1,79 @@
 """Run a cohort: one table row per case and treatment, also where a case fails.
 
-Each row is written into the folder of its case as soon as it is known, under a key of everything it depends on: the
-hash of the input, the settings and the version. A later run computes only the rows that are missing. The table is
-collected from the rows.
+Each row is stored in the folder of its case as soon as it is known, under a key of everything it depends on. A later
+run computes only the rows that are missing. The table is collected from the rows.
 """
 
-from collections.abc import Sequence
-from dataclasses import replace
+import shutil
+import sys
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
 from vstent.cohort.cases import Case
-from vstent.cohort.work import LOST, Row, Task, picture_path, read_row, work, write_row
+from vstent.devices.treatment import BARE
+from vstent.errors import VstentError
+from vstent.io.files import atomic
 from vstent.io.tables import write_parquet, write_rows
-from vstent.study.workers import AbstractWorkers
+from vstent.io.writers import write_text
+from vstent.reporting.figures import patient_picture
+from vstent.study.folder import CACHE
+from vstent.study.pipeline import restore_vessel, run
+from vstent.study.progress import OnProgress, Progress
+from vstent.study.settings import Settings
+from vstent.study.store import Key, Store
+from vstent.study.workers import AbstractWorkers, alone
+from vstent.units import BYTES_PER_MB
+
+Row = dict[str, Any]
+"""One case with one treatment: column name to value."""
 
 CASES: Final = "cases"
 """Subfolder of the output folder that holds one folder per case."""
+COST: Final = ("case_s", "case_cpu_s", "peak_memory_MB")
+"""Columns on run time and memory; they describe the computer, so they differ between runs."""
+DONE: Final = "done"
+"""Outcome of a treatment that was deployed and measured."""
+FAILED: Final = "failed"
+"""Outcome where the input cannot be used or a flow cannot be computed; a repetition would give the same."""
+LOST: Final = "lost"
+"""Outcome where the process died; the next run repeats the case."""
 
 
-class Progress(Protocol):
+class OnCase(Protocol):
     """Called when a case has ended."""
 
     def __call__(self, done: int, total: int, name: str, rows: Sequence[Row]) -> None:
         """Report that `done` of `total` cases have ended; the last one is called `name` and has these rows."""
 
 
-def left_to_do(cases: Sequence[Case], out: Path, *, keeps_files: bool = False) -> list[Task]:
-    """Return the work that is missing: cases with those treatments whose row is missing or whose process died.
+@dataclass(frozen=True, eq=False)
+class Task:
+    """Remaining work of one case."""
 
-    Parameters
-    ----------
-    cases : cases of the cohort.
-    out : output folder of the cohort.
-    keeps_files : whether all files of every study are kept.
+    case: Case
+    """The case; its treatments are those whose rows are missing."""
+    folder: Path
+    """Folder in which its rows are stored."""
+    keys: Mapping[str, Key]
+    """Key of every missing row, by treatment."""
+    keeps_files: bool
+    """Whether all files of `vstent run` are kept, in subfolder ``study``."""
+
+
+def left_to_do(cases: Sequence[Case], out: Path, *, keeps_files: bool = False) -> list[Task]:
+    """Return the work that is missing in an output folder: cases with treatments without a row, or whose process died.
+
+    All files of every study are kept where `keeps_files`.
     """
     tasks = []
     for case in cases:
-        folder, keys = _folder(case, out), case.keys
-        rows = {treatment: read_row(folder, treatment, key) for treatment, key in keys.items()}
-        missing = {name for name, row in rows.items() if row is None or row["outcome"] == LOST}
+        folder, keys = out / CASES / case.name, case.keys
+        rows = read_rows(folder, keys)
+        missing = {name for name in keys if rows.get(name, {}).get("outcome", LOST) == LOST}
         if missing:
             treatments = tuple(one for one in case.settings.treatments if one.name in missing)
             shorter = replace(case, settings=replace(case.settings, treatments=treatments))
@@ -47,15 +81,8 @@ def left_to_do(cases: Sequence[Case], out: Path, *, keeps_files: bool = False) -
     return tasks
 
 
-def run_cohort(tasks: Sequence[Task], out: Path, workers: AbstractWorkers, progress: Progress) -> None:
-    """Run tasks in parallel; a case whose process died gets rows that state it.
-
-    Parameters
-    ----------
-    tasks : tasks from `left_to_do`.
-    out : output folder of the cohort.
-    workers : processes or cluster that runs the tasks.
-    progress : called when a case has ended.
+def run_cohort(tasks: Sequence[Task], out: Path, workers: AbstractWorkers, progress: OnCase) -> None:
+    """Run tasks of `left_to_do` in parallel; a case whose process died gets rows that state it.
 
     Raises
     ------
@@ -66,33 +93,19 @@ def run_cohort(tasks: Sequence[Task], out: Path, workers: AbstractWorkers, progr
     """
     for done, ended in enumerate(workers.do(work, tasks), start=1):
         task = tasks[ended.number]
-        for treatment, key in task.keys.items():
-            if read_row(task.folder, treatment, key) is None:
-                write_row(task, treatment, {"outcome": LOST, "stage": "", "sentence": ended.fault})
+        for treatment in task.keys.keys() - read_rows(task.folder, task.keys).keys():
+            _write_row(task, treatment, {"outcome": LOST, "stage": "", "sentence": ended.fault})
         progress(done, len(tasks), task.case.name, collect([task.case], out))
 
 
 def collect(cases: Sequence[Case], out: Path) -> list[Row]:
-    """Return the rows that exist, in the order of cases and treatments.
-
-    Parameters
-    ----------
-    cases : cases of the cohort.
-    out : output folder of the cohort.
-    """
-    rows = [read_row(_folder(case, out), treatment, key) for case in cases for treatment, key in case.keys.items()]
-    return [row for row in rows if row is not None]
+    """Return the rows that exist in an output folder, in the order of cases and treatments."""
+    return [row for case in cases for row in read_rows(out / CASES / case.name, case.keys).values()]
 
 
 def pictures_of(rows: Sequence[Row], out: Path) -> dict[tuple[str, str], bytes]:
-    """Return the pictures that exist of cases with treatments, as WebP by name of case and treatment.
-
-    Parameters
-    ----------
-    rows : rows of the cohort table.
-    out : output folder of the cohort.
-    """
-    paths = {(row["case"], row["treatment"]): picture_path(out / CASES / row["case"], row["treatment"]) for row in rows}
+    """Return the pictures that exist of cases with treatments, as WebP by name of case and treatment."""
+    paths = {(row["case"], row["treatment"]): out / CASES / row["case"] / f"{row['treatment']}.webp" for row in rows}
     return {key: path.read_bytes() for key, path in paths.items() if path.is_file()}
 
 
@@ -103,6 +116,107 @@ def write_table(out: Path, rows: Sequence[Row]) -> list[Path]:
     return [out / "cohort.csv", *([out / "cohort.parquet"] if is_written else [])]
 
 
-def _folder(case: Case, out: Path) -> Path:
-    """Return the folder of a case in the output folder `out`."""
-    return out / CASES / case.name
+def work(task: Task) -> None:
+    """Run one case: deploy every missing treatment and write the rows.
+
+    A treatment that does not fit, or an input that cannot be used, gives a row with its stage and error message.
+    """
+    case, study = task.case, task.folder / "study"
+    with alone():
+        began, cpu = time.perf_counter(), time.process_time()
+        rows = _rows(task)
+        done = tuple(one for one in case.settings.treatments if rows[one.name]["outcome"] == DONE)
+        if task.keeps_files and done and len(rows) > 1:  # one study of all treatments, read from stored results
+            run(case.path, study, replace(case.settings, treatments=done), replaces=True)
+        if not task.keeps_files:
+            shutil.rmtree(study, ignore_errors=True)
+        spent = time.perf_counter() - began, time.process_time() - cpu, peak_memory_MB()
+        for treatment, row in rows.items():
+            _write_row(task, treatment, row | dict(zip(COST, spent, strict=True)))
+
+
+def _rows(task: Task) -> dict[str, Row]:
+    """Return the rows of a case by treatment; the artery is restored once, and failures are rows too."""
+    case, study = task.case, task.folder / "study"
+    treatments = case.settings.treatments
+    failed = _failure(task, lambda progress: restore_vessel(case.path, study, case.settings, progress, replaces=True))
+    if failed:
+        return {treatment.name: failed for treatment in treatments}
+    rows: dict[str, Row] = {}
+    for treatment in treatments:
+        name, settings = treatment.name, replace(case.settings, treatments=(treatment,))
+
+        def with_treatment(progress: OnProgress, name: str = name, settings: Settings = settings) -> None:
+            found = run(case.path, study, settings, progress, replaces=True)
+            implants = list(found.implants[name].values())
+            with atomic(task.folder / f"{name}.webp") as partial:
+                partial.write_bytes(patient_picture(found.anatomy, implants).webp)
+            advice = " ".join(one.advice for one in implants)
+            rows[name] = {"outcome": DONE, "stage": "", "sentence": advice} | flat_metrics(found.metrics, name)
+
+        failed = _failure(task, with_treatment)
+        if failed:
+            rows[name] = failed
+    return rows
+
+
+def _failure(task: Task, do: Callable[[OnProgress], object]) -> Row:
+    """Call a function and return the row of its failure, with the stage that it reported; empty where it succeeds."""
+    stage = "read"
+
+    def told(now: Progress) -> None:
+        nonlocal stage
+        stage = now.stage
+
+    try:
+        do(told)
+    except VstentError as error:
+        return {"outcome": FAILED, "stage": stage, "sentence": str(error)}
+    except Exception as error:  # noqa: BLE001 one failed case must not end the cohort; its row states the error
+        write_text(task.folder / "traceback.txt", traceback.format_exc())
+        sentence = f"unexpected error, {type(error).__name__}: {error}. Please report it with traceback.txt."
+        return {"outcome": FAILED, "stage": stage, "sentence": sentence}
+    return {}
+
+
+def flat_metrics(metrics: Mapping[str, Any], treatment: str) -> Row:
+    """Return all metrics of a study that concern one treatment, under dotted keys.
+
+    Measures of the implant of a treatment with one begin with ``implant``, those of several with ``implants.ID``.
+    """
+    found = dict(metrics["treatments"][treatment])
+    implants = found.pop("implants")
+    parts = {"vessel": metrics["vessel"], BARE: metrics["treatments"].get(BARE, {}).get("flow", {})}
+    alone = {"implant": next(iter(implants.values()))} if len(implants) == 1 else {"implants": implants}
+    return _flat(parts | alone | found, "")
+
+
+def _flat(values: Mapping[str, Any], before: str) -> Row:
+    """Return nested values under dotted keys."""
+    row: Row = {}
+    for name, value in values.items():
+        row |= _flat(value, f"{before}{name}.") if isinstance(value, Mapping) else {f"{before}{name}": value}
+    return row
+
+
+def _write_row(task: Task, treatment: str, row: Row) -> None:
+    """Store the row of a treatment under its key, its columns in the order of their names."""
+    named = sorted(({"case": task.case.name, "treatment": treatment} | row).items())
+    settings = asdict(task.case.settings)
+    Store(task.folder / CACHE).write(treatment, task.keys[treatment], {}, values=dict(named), settings=settings)
+
+
+def read_rows(folder: Path, keys: Mapping[str, Key]) -> dict[str, Row]:
+    """Return the rows in the folder of a case that are stored under these keys, by treatment."""
+    records = {treatment: Store(folder / CACHE).record(treatment, key) for treatment, key in keys.items()}
+    return {treatment: dict(record["values"]) for treatment, record in records.items() if record}
+
+
+def peak_memory_MB() -> float | None:
+    """Return the largest resident memory of this process so far; None where the system does not report it."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    per_unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * per_unit / BYTES_PER_MB

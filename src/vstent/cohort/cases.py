@@ -1,7 +1,7 @@
 """Read the cases of a cohort from a folder or a CSV file."""
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,6 +14,7 @@ from vstent.flow.simulation import check_engine
 from vstent.io.files import IMAGE_SUFFIXES, SURFACE_SUFFIXES, existing, suffix
 from vstent.study.keys import hash_of, measures_key, study_keys
 from vstent.study.settings import OPTIONS, Settings, settings_of
+from vstent.study.store import Key
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,25 +29,21 @@ class Case:
     """Settings of the study, with the treatments to compare."""
 
     @cached_property
-    def keys(self) -> dict[str, str]:
+    def keys(self) -> dict[str, Key]:
         """Key of the row of every treatment; it covers everything that the row depends on."""
         source, keys = hash_of(self.path), {}
         for treatment in self.settings.treatments:
             alone = replace(self.settings, treatments=(treatment,))
-            keys[treatment.name] = str(measures_key(alone, study_keys(source, alone), {}))
+            keys[treatment.name] = measures_key(alone, study_keys(source, alone), {})
         return keys
 
 
 def find_cases(cohort: Path, given: Mapping[str, Any]) -> tuple[Case, ...]:
-    """Return the cases of a folder (every scan or surface in it) or of a CSV file.
+    """Return the cases of a folder (every scan or surface in it) or of a CSV file with column titles.
 
-    Parameters
-    ----------
-    cohort : a folder, or a CSV file with column titles. Column ``input`` holds paths and ``case`` names (default: the
-        file name); every option of the settings may be a column of its name. Paths are relative to the folder of the
-        file. A flag is yes or no, and several values, such as devices or inlets, are separated by semicolons. An empty
-        cell takes the value of `given`.
-    given : values of options for every case, by name.
+    Column ``input`` holds paths and ``case`` names (default: the file name); every option of the settings may be a
+    column of its name. Paths are relative to the folder of the file. A flag is yes or no, and several values, such as
+    devices or inlets, are separated by semicolons. An empty cell takes the value of `given`, options by name.
 
     Raises
     ------
@@ -56,7 +53,12 @@ def find_cases(cohort: Path, given: Mapping[str, Any]) -> tuple[Case, ...]:
         A row of the file cannot be used, or two cases have the same name.
     """
     existing(cohort)
-    cases = _in_folder(cohort, settings_of(given)) if cohort.is_dir() else _in_file(cohort, given)
+    if cohort.is_dir():
+        settings = settings_of(given)
+        shown = sorted(path for path in cohort.iterdir() if not path.name.startswith("."))
+        cases = [Case(_name(path), path, settings) for path in shown if _is_case(path)]
+    else:
+        cases = _in_file(cohort, given)
     if not cases:
         raise ReadError(f"{cohort} holds no cases: give a folder of scans or surfaces, or a CSV file of their paths")
     names = [case.name for case in cases]
@@ -70,12 +72,6 @@ def find_cases(cohort: Path, given: Mapping[str, Any]) -> tuple[Case, ...]:
     for flow in {case.settings.flow for case in cases}:
         check_engine(flow)
     return tuple(cases)
-
-
-def _in_folder(folder: Path, settings: Settings) -> list[Case]:
-    """Return a case for every scan or surface of a folder, in the order of their names."""
-    shown = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
-    return [Case(_name(path), path, settings) for path in shown if _is_case(path)]
 
 
 def _is_case(path: Path) -> bool:
@@ -115,32 +111,22 @@ def _case(file: Path, line: int, row: Mapping[str, Any], given: Mapping[str, Any
     name = cells.pop("case", _name(path))
     if Path(name).name != name:
         raise InputError(f"{where} names its case {name!r}: give a name without slashes")
+    values = dict(given)
     try:
-        return Case(name, path, settings_of({**given, **_read(cells, file.parent)}))
+        for title, text in cells.items():
+            try:
+                if title in OPPOSITES:
+                    values |= {OPPOSITES[title]: None} if flag(text) else {}
+                else:
+                    values[title] = OPTIONS[title].cell(text, file.parent)
+            except InputError as error:
+                raise InputError(f"column {title}: {error}") from error
+        return Case(name, path, settings_of(values))
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
-
-
-def _read(cells: Mapping[str, str], folder: Path) -> dict[str, Any]:
-    """Return the values of options that the cells of a row state; `folder` is that of the file."""
-    found: dict[str, Any] = {}
-    for title, text in cells.items():
-        try:
-            if title in OPPOSITES:
-                found |= {OPPOSITES[title]: None} if flag(text) else {}
-            else:
-                found[title] = OPTIONS[title].cell(text, folder)
-        except InputError as error:
-            raise InputError(f"column {title}: {error}") from error
-    return found
 
 
 OPPOSITES: Final = {option.off[0]: name for name, option in OPTIONS.items() if option.off[0]}
 """Options that switch another one off, and that one."""
 COLUMNS: Final = ("case", "input", *OPTIONS, *OPPOSITES)
 """Columns of a CSV file."""
-
-
-def row_count(cases: Sequence[Case]) -> int:
-    """Return the number of rows of the cohort's table."""
-    return sum(len(case.settings.treatments) for case in cases)

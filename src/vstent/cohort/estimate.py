@@ -1,12 +1,13 @@
 """Estimate run time and memory of a cohort before it starts."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 from vstent.cohort.cases import Case
+from vstent.flow.memory import free_memory_bytes
 from vstent.io.files import is_surface_file, suffix
+from vstent.units import BYTES_PER_MB
 
 START_CPU_S: Final = 3.0
 """CPU time in s to start a process and load its compiled kernels."""
@@ -59,23 +60,17 @@ class Estimate:
 
 
 def estimate(cases: Sequence[Case], jobs: int) -> Estimate:
-    """Return the estimated run time and memory of cases, from the sizes of their files.
-
-    Parameters
-    ----------
-    cases : cases to run.
-    jobs : number of parallel processes requested.
-    """
+    """Return the estimated run time and memory of cases with parallel processes, from the sizes of their files."""
     costs = [_cost(case) for case in cases]
     memory_MB = max((memory for _, memory in costs), default=START_MB)
-    free_MB = _free_memory_MB()
-    bearable = jobs if free_MB is None else max(1, int(free_MB / memory_MB))
-    return Estimate(sum(cpu for cpu, _ in costs), memory_MB, min(jobs, bearable))
+    bearable = max(1.0, free_memory_bytes() / BYTES_PER_MB / memory_MB)
+    return Estimate(sum(cpu for cpu, _ in costs), memory_MB, int(min(jobs, bearable)))
 
 
 def _cost(case: Case) -> tuple[float, float]:
     """Return CPU time in s and memory in MB of one case."""
-    n_bytes = _bytes(case)
+    files = case.path.rglob("*") if case.path.is_dir() else [case.path]
+    n_bytes = sum(file.stat().st_size for file in files if file.is_file())
     is_surface = is_surface_file(case.path)
     voxels = 0.0 if is_surface else n_bytes * (4 if suffix(case.path).endswith(".gz") else 1) / 2
     triangles = n_bytes / STL_BYTES if is_surface else SCAN_TRIANGLES
@@ -89,17 +84,3 @@ def _cost(case: Case) -> tuple[float, float]:
         cpu_s += (1 + n_devices) * CPU_S_PER_1000_CELLS * finer * cells / 1e3
         memory += MB_PER_1000_CELLS * cells / 1e3
     return cpu_s, memory
-
-
-def _bytes(case: Case) -> int:
-    """Return the size of the files of a case in bytes."""
-    files = case.path.rglob("*") if case.path.is_dir() else [case.path]
-    return sum(file.stat().st_size for file in files if file.is_file())
-
-
-def _free_memory_MB() -> float | None:
-    """Return the memory available to new processes in MB; None where the system does not report it."""
-    try:
-        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e6
-    except (AttributeError, ValueError, OSError):
-        return None

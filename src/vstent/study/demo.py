@@ -7,7 +7,7 @@ import numpy as np
 
 from vstent.io.dicom_writer import write_dicom
 from vstent.kernels import curves
-from vstent.phantoms import Phantom, demo_phantom, scan
+from vstent.phantoms import demo_phantom, scan
 from vstent.study.pipeline import CaseResult
 
 SEED: Final = 20161  # seed of the scan's noise; the value is arbitrary
@@ -28,16 +28,13 @@ def write_scan(folder: Path) -> Path:
 
 
 def truth(case: CaseResult) -> list[Row]:
-    """Compare a study of the demo's scan with the phantom.
-
-    Parameters
-    ----------
-    case : study of the scan that `write_scan` writes.
-
-    Returns title, found value, true value and unit.
-    """
-    phantom = demo_phantom()
-    found_mm, true_mm = _radii_mm(case, phantom)
+    """Compare a study of the scan of `write_scan` with the phantom; the ends of the artery are left out."""
+    phantom, path = demo_phantom(), case.anatomy.parent
+    margin = 2 * END_DIAMETERS * float(path.axis.inscribed_radius_mm.mean())
+    inner = (path.axis.abscissa_mm > margin) & (path.axis.abscissa_mm < path.axis.length_mm - margin)
+    place = curves.project(phantom.parent.points_mm, path.axis.points_mm[inner])[0]
+    found_mm = path.section_radius_mm[inner]
+    true_mm = np.interp(place, phantom.parent.abscissa_mm, phantom.parent.inscribed_radius_mm)
     rows = [("Artery radius, mean along the axis", float(found_mm.mean()), float(true_mm.mean()), "mm")]
     worst = np.argmax(np.abs(found_mm / true_mm - 1))
     rows.append(("Artery radius, worst place", float(found_mm[worst]), float(true_mm[worst]), "mm"))
@@ -49,13 +46,3 @@ def truth(case: CaseResult) -> list[Row]:
             outside_mm = float(measures["max_outside_mm"])
             rows.append((f"Farthest node of {name} outside the landing surface", outside_mm, 0.0, "mm"))
     return rows
-
-
-def _radii_mm(case: CaseResult, phantom: Phantom) -> tuple[np.ndarray, np.ndarray]:
-    """Return the radius of the landing surface and of the phantom at the same points, without the ends."""
-    path, parent = case.anatomy.parent, phantom.parent
-    axis = path.axis
-    margin = 2 * END_DIAMETERS * float(axis.inscribed_radius_mm.mean())
-    inner = (axis.abscissa_mm > margin) & (axis.abscissa_mm < axis.length_mm - margin)
-    place = curves.project(parent.points_mm, axis.points_mm[inner])[0]
-    return path.section_radius_mm[inner], np.interp(place, parent.abscissa_mm, parent.inscribed_radius_mm)

@@ -19,12 +19,12 @@ from vstent.flow.openfoam.setup import FoamSetup
 from vstent.flow.problem import flow_case
 from vstent.geometry.vessel import Anatomy
 from vstent.io import writers
-from vstent.study.folder import CACHE, RUN, refuse_older
-from vstent.study.keys import anatomy_keys, hash_of
+from vstent.study.folder import CACHE, refuse_older
+from vstent.study.keys import hash_of, study_keys
 from vstent.study.progress import OnProgress
 from vstent.study.repeat import finished_run
 from vstent.study.settings import AnatomySettings, InputSettings, Settings
-from vstent.study.stages import check_inflow, deploy_implant, find_anatomy, finished_anatomy
+from vstent.study.stages import check_inflow, deploy_all, find_anatomy, finished_anatomy
 from vstent.study.store import Store
 
 
@@ -35,9 +35,9 @@ def export_openfoam(path: Path, out: Path, settings: Settings, foam: Mapping[str
     that of the installed OpenFOAM. Where InputError is raised, nothing has been written.
     """
     store = Store(out / CACHE, progress)
-    anatomy = _anatomy(path, settings, store)
+    anatomy, stents = _deployed(path, settings, store, progress)
     check_inflow(anatomy, settings.flow)
-    case = flow_case(anatomy, _implants(path, anatomy, settings, store), settings.flow)
+    case = flow_case(anatomy, stents, settings.flow)
     setup = FoamSetup(default_cell_size_mm(case), processes=case.numerics.processes)
     try:
         installed = program.find().flavour
@@ -57,7 +57,7 @@ def export_patches(path: Path, out: Path, settings: Settings, progress: OnProgre
     ``patches.json`` describes the patches, and ``neck.stl`` is the surface through which blood enters the sac.
     """
     store = Store(out / CACHE, progress)
-    case = flow_case(_anatomy(path, settings, store))
+    case = flow_case(_deployed(path, replace(settings, treatments=()), store, progress)[0])
     with store.stage("export") as tell:
         patches, _ = named_patches(case)
         patch_id = np.zeros(len(patches[0].surface.faces), dtype=np.int32)
@@ -87,33 +87,28 @@ def export_patches(path: Path, out: Path, settings: Settings, progress: OnProgre
     return said
 
 
-def _anatomy(path: Path, settings: Settings, store: Store) -> Anatomy:
-    """Return the anatomy of the run of a case folder, or that of an input."""
+def _deployed(path: Path, settings: Settings, store: Store, progress: OnProgress) -> tuple[Anatomy, list[Stent]]:
+    """Return the anatomy of the run of a case folder, or of an input, and the implants of the first treatment.
+
+    They are as given, else as in the case folder's own run, else as proposed.
+    """
     refuse_older(path, "Run its study again into another folder, and export that.")
-    if not (path / CACHE).is_dir():
-        return find_anatomy(path, settings, store, anatomy_keys(hash_of(path), settings))
-    given = [*differing(InputSettings(), settings.input), *differing(AnatomySettings(), settings.anatomy)]
-    if given:
-        words = ", ".join(f"--{name}" for name in given)
-        raise InputError(f"{path} is a case folder, whose vessel is exported as it is: leave out {words}")
-    with store.stage("anatomy") as tell:
-        anatomy = finished_anatomy(path, Store(path / CACHE), anatomy_keys(*finished_run(path)))
-        tell(f"taken from {path}")
-    return anatomy
-
-
-def _implants(path: Path, anatomy: Anatomy, settings: Settings, store: Store) -> list[Stent]:
-    """Return the implants of the first treatment, as given, else as in the case folder's own run, else as proposed."""
-    if not settings.treatments:
-        return []
-    treatment = settings.treatments[0]
-    if treatment.is_proposed and (path / RUN).exists():
-        found = {one.name: one for one in finished_run(path)[1].treatments if one.devices == treatment.devices}
-        treatment = found.get(treatment.name, treatment)
-    stents: dict[str, Stent] = {}
-    for implant in treatment.implants:
-        with store.stage(f"deploy {implant.id}") as tell:
-            deployment = deploy_implant(implant, anatomy, [stents[name] for name in implant.inside])
-            tell(deployment.advice)
-        stents[implant.id] = deployment.stent
-    return list(stents.values())
+    study = replace(settings, treatments=settings.treatments[:1], flow=None, uncertainty=None)
+    if (path / CACHE).is_dir():
+        given = [*differing(InputSettings(), settings.input), *differing(AnatomySettings(), settings.anatomy)]
+        if given:
+            words = ", ".join(f"--{name}" for name in given)
+            raise InputError(f"{path} is a case folder, whose vessel is exported as it is: leave out {words}")
+        source, of_run = finished_run(path)
+        known = {(one.name, one.devices): one for one in of_run.treatments}
+        chosen = [known.get((one.name, one.devices), one) if one.is_proposed else one for one in study.treatments]
+        study = replace(study, input=of_run.input, anatomy=of_run.anatomy, treatments=tuple(chosen))
+        store, keys = Store(path / CACHE, progress), study_keys(source, study)
+        anatomy = finished_anatomy(path, store, keys)
+    else:
+        keys = study_keys(hash_of(path), study)
+        anatomy = find_anatomy(path, study, store, keys)
+    if not study.treatments:
+        return anatomy, []
+    (implants,) = deploy_all(anatomy, study, store, keys)[0].values()
+    return anatomy, [implant.stent for implant in implants.values()]

@@ -21,34 +21,15 @@ from vstent.flow.settings import FlowSettings
 from vstent.flow.simulation import check_engine
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io import writers
+from vstent.study import outputs, stages
 from vstent.study.contrast import add_measures, stored_measures
 from vstent.study.crate import NAME as CRATE
 from vstent.study.folder import CACHE, INPUT, LAYOUT, METRICS, RUN, TREATMENTS, claiming, implant_folder
 from vstent.study.former import merged, note_begun, refuse_other_anatomy, refuse_other_input
 from vstent.study.keys import ANATOMY, VESSEL, anatomy_keys, hash_of, key_of, measures_key, stage_name, study_keys
-from vstent.study.outputs import (
-    IMPLANT,
-    take_away_measures,
-    take_away_results,
-    take_away_study,
-    write_anatomy,
-    write_implant,
-    write_vessel,
-)
 from vstent.study.progress import OnProgress, Progress
 from vstent.study.repeat import SECONDS, former_source, is_of_another, provenance
 from vstent.study.settings import Settings
-from vstent.study.stages import (
-    check_inflow,
-    compute_flows,
-    deploy_all,
-    engine_folders,
-    find_anatomy,
-    find_vessel,
-    measure_study,
-    plan_flows,
-    vary_all,
-)
 from vstent.study.store import Key, Store, silent
 
 
@@ -128,32 +109,32 @@ def run(
         settings = merged(out, source, settings)
     keys = study_keys(source, settings)
     store.foretell(keys)
-    anatomy = find_anatomy(path, settings, store, keys)
-    check_inflow(anatomy, settings.flow)
-    implants, failures = deploy_all(anatomy, settings, store, keys)
+    anatomy = stages.find_anatomy(path, settings, store, keys)
+    stages.check_inflow(anatomy, settings.flow)
+    implants, failures = stages.deploy_all(anatomy, settings, store, keys)
     record = provenance(path, source, settings)
     has_former = replaces and is_of_another(out, record)
     named = [treatment.name for treatment in settings.treatments]
     _save_deferred(path, out, source, store, named, is_replaced=has_former)
     note_begun(out, settings)
     if has_former:
-        take_away_study(out, engine_folders(out, settings).values())
+        outputs.take_away_study(out, stages.engine_folders(out, settings).values())
     (out / CRATE).unlink(missing_ok=True)  # it describes files that this run replaces
-    write_anatomy(out, anatomy)
+    outputs.write_anatomy(out, anatomy)
     for treatment in settings.treatments:
         for implant in treatment.implants if treatment.name in implants else ():
             folder, name = implant_folder(out, treatment.name, implant.id), stage_name(treatment, implant)
             key = key_of("vstent.study.outputs:write_implant", keys[f"deploy {name}"])
-            write = partial(write_implant, folder, implants[treatment.name][implant.id])
-            store.write_once(f"struts {name}", key, folder, IMPLANT, write)
-    fields, unflown = compute_flows(out, anatomy, implants, settings, store, keys)
+            write = partial(outputs.write_implant, folder, implants[treatment.name][implant.id])
+            store.write_once(f"struts {name}", key, folder, outputs.IMPLANT, write)
+    fields, unflown = stages.compute_flows(out, anatomy, implants, settings, store, keys)
     failures |= unflown
-    varied = vary_all(anatomy, implants, settings, store, keys)
+    varied = stages.vary_all(anatomy, implants, settings, store, keys)
     computed = Computed(anatomy, implants, fields, store.load(VESSEL, keys[VESSEL], Vessel))
 
     def measures() -> dict[str, Any]:
         progress(Progress("measure", 0.0, computed=computed))
-        return measure_study(anatomy, implants, fields, settings, varied, failures)
+        return stages.measure_study(anatomy, implants, fields, settings, varied, failures)
 
     metrics = store.compute_once("measure", measures_key(settings, keys, failures), measures)
     add_measures(metrics, stored_measures(out, keys) if fields else {})
@@ -178,9 +159,9 @@ def run(
 def trace_vessel(path: Path, out: Path, settings: Settings, progress: OnProgress, *, replaces: bool = False) -> Vessel:
     """Find the vessel, its openings and its centerlines, untrimmed, and write them; all else as in `run`."""
     store, source = _begun(path, out, settings, progress, replaces)
-    vessel = find_vessel(path, settings, store, anatomy_keys(source, settings))
+    vessel = stages.find_vessel(path, settings, store, anatomy_keys(source, settings))
     _save_deferred(path, out, source, store)
-    write_vessel(out, vessel)
+    outputs.write_vessel(out, vessel)
     return vessel
 
 
@@ -193,10 +174,10 @@ def restore_vessel(
     A study in the same folder reuses the result, and the other way round. Errors and `replaces` are as in `run`.
     """
     store, source = _begun(path, out, settings, progress, replaces)
-    anatomy = find_anatomy(path, settings, store, anatomy_keys(source, settings))
+    anatomy = stages.find_anatomy(path, settings, store, anatomy_keys(source, settings))
     measures = morphology(anatomy)
     _save_deferred(path, out, source, store)
-    write_anatomy(out, anatomy)
+    outputs.write_anatomy(out, anatomy)
     writers.write_json(out / "morphology.json", measures)
     return anatomy, measures
 
@@ -211,11 +192,11 @@ def refine_flow(
     """
     check_engine(settings.flow)
     store, source = _begun(path, out, settings, progress, replaces)
-    anatomy = find_anatomy(path, settings, store, anatomy_keys(source, settings))
-    check_inflow(anatomy, settings.flow)
+    anatomy = stages.find_anatomy(path, settings, store, anatomy_keys(source, settings))
+    stages.check_inflow(anatomy, settings.flow)
     _save_deferred(path, out, source, store)
     flow = settings.flow or FlowSettings()
-    plan_flows(anatomy, {BARE: ()}, flow, store)
+    stages.plan_flows(anatomy, {BARE: ()}, flow, store)
     with store.stage("convergence") as tell:
         sentences: list[str] = []
 
@@ -253,10 +234,10 @@ def _save_deferred(
     removed = {folder.name for folder in (out / TREATMENTS).glob("*")} - {BARE, *named}
     if removed and (is_of_other_input or is_replaced):
         names = ", ".join(sorted(removed))
-        store.progress("stored results", 1.0, f"removed, because this command replaces them by none: {names}.")
+        store.progress("stored results", 1.0, f"removed, because this command does not name them: {names}.")
     if is_of_other_input:
-        take_away_results(out)
+        outputs.take_away_results(out)
     elif former is not None and store.is_deferred(ANATOMY):
-        take_away_measures(out)
+        outputs.take_away_measures(out)
     writers.write_json(out / CACHE / INPUT, {"layout": LAYOUT, "path": str(path.resolve()), "sha256": source})
     store.save_deferred()

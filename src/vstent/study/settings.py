@@ -6,27 +6,15 @@ the command line appears at once.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from dataclasses import fields as fields_of
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
 
+from vstent import fields
 from vstent.devices.treatment import Treatment, read_treatment, with_device
 from vstent.errors import InputError
-from vstent.fields import (
-    LENGTH,
-    POSITION,
-    Limits,
-    Option,
-    box,
-    flag,
-    point,
-    sections_of,
-    setting,
-    shape,
-    spacing,
-    stated,
-    whole,
-)
+from vstent.fields import LENGTH, POSITION, Limits, Option, box, flag, point, setting, shape, spacing, whole
 from vstent.flow.settings import HIGH_SHEAR_VISCOSITY_PA_S, FlowSettings
 from vstent.plan.ranges import Ranges
 
@@ -74,12 +62,7 @@ class InputSettings:
         None, "shape", "number of voxels of a raw volume, fastest axis first", shape, Limits(low=1, high=100_000)
     )
     crop_mm: tuple[Point, Point] | None = setting(
-        None,
-        "crop",
-        "corners of the box along the image axes to which a scan is cropped",
-        box,
-        POSITION,
-        "whole scan",
+        None, "crop", "corners of the box along the image axes to which a scan is cropped", box, POSITION, "whole scan"
     )
     threshold: float | None = setting(
         None, "threshold", "intensity at the lumen wall of a scan", usual="half way from tissue to lumen", metavar="T"
@@ -150,7 +133,7 @@ class Settings:
         return tuple(dict.fromkeys(device for treatment in self.treatments for device in treatment.devices))
 
 
-STATED: Final = stated(Settings)
+STATED: Final = fields.stated(Settings)
 """Option of every setting that has one, by the dotted path of the setting."""
 OPTIONS: Final = {option.name: option for option in STATED.values()}
 """All options by name."""
@@ -164,11 +147,7 @@ def in_section(name: str) -> dict[str, Option]:
 
 
 def settings_of(given: Mapping[str, Any]) -> Settings:
-    """Return the settings that options state.
-
-    Parameters
-    ----------
-    given : values by name of the option, as `Option.value` returns them; None: not given.
+    """Return the settings that options state, from values by name as `Option.value` returns them; None: not given.
 
     Raises
     ------
@@ -193,7 +172,7 @@ def settings_of(given: Mapping[str, Any]) -> Settings:
 def _section(kind: Any, given: Mapping[str, Any]) -> Any:
     """Return a section of the settings with the values that options state, points in LPS."""
     values = {}
-    for one in fields(kind):
+    for one in fields_of(kind):
         option: Option | None = one.metadata.get("option")
         if option is not None and option.name in given:
             value = given[option.name]
@@ -201,8 +180,8 @@ def _section(kind: Any, given: Mapping[str, Any]) -> Any:
                 value = option.check(option.load(value))
             is_ras = option.limits is POSITION and given.get("frame") == "ras"
             values[one.name] = _from_ras(value) if is_ras else value
-        elif option is None and sections_of(one.type):
-            values[one.name] = _section(sections_of(one.type)[0], given)
+        elif option is None and fields.sections_of(one.type):
+            values[one.name] = _section(fields.sections_of(one.type)[0], given)
     return kind(**values)
 
 
