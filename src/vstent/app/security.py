@@ -51,13 +51,9 @@ class TooLarge(HTTPException):
 
 
 class Guard:
-    """Accepts requests only from the page itself with the token, and sets the headers of every response.
+    """Accepts requests only from the page itself, at accepted host names with port, with the secret token.
 
-    Parameters
-    ----------
-    app : the application.
-    token : secret token.
-    hosts : accepted host names with port.
+    It sets the headers of every response.
     """
 
     def __init__(self, app: ASGIApp, *, token: str, hosts: Iterable[str]) -> None:
