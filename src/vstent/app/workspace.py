@@ -10,11 +10,11 @@ from typing import Any, Final
 from vstent.app import intake
 from vstent.app.cases import STATE, STEPS, Case, Cases, dependencies, failures, statuses
 from vstent.app.choices import pulse_of
-from vstent.app.finished import REPORT, RUN, kept_flows, kept_histories, lost_steps, reopened, stem
+from vstent.app.finished import REPORT, RUN, kept_flows, kept_histories, lost_steps, reopened
 from vstent.app.jobs import KINDS, RANKING, Jobs
 from vstent.devices.treatment import BARE, Treatment
 from vstent.errors import InputError, ReadError
-from vstent.io.files import atomic, existing
+from vstent.io.files import atomic, existing, suffix
 
 PICTURE: Final = ".picture.png"
 """File of a case folder with its picture in the list of cases."""
@@ -52,7 +52,8 @@ class Workspace:
         elif (path / RUN).is_file():
             self.opened = reopened(self.cases, path).id
         else:
-            case = self.cases.of_input(path) or self.cases.create(stem(path))
+            ending = suffix(path) if path.is_file() else ""
+            case = self.cases.of_input(path) or self.cases.create(path.name[: len(path.name) - len(ending)])
             self.opened = case.id
             if not case.state.source:
                 self._to_begin = (case, path)
@@ -425,7 +426,7 @@ def _is_surface(case: Case) -> bool:
 
 def _wants_grid(case: Case) -> bool:
     """Return whether number and spacing of the voxels must be given before the scan can be read."""
-    from vstent.io.files import RAW_SUFFIXES, suffix
+    from vstent.io.files import RAW_SUFFIXES
 
     choices = case.state.choices
     return suffix(case.input) in RAW_SUFFIXES and (choices.shape is None or choices.spacing_mm is None)
