@@ -5,9 +5,8 @@ const STEP_MM = 0.5;
 const LEAST_MM = 1;
 
 export class Trimming {
-  /** @param host {chosen({upstream_mm | downstream_mm}), told(which, mm)} */
-  constructor(host) {
-    this.host = host;
+  constructor(page) {
+    this.page = page;
     this.handles = [this.handle("upstream_mm", "proximal", "before"), this.handle("downstream_mm", "distal", "beyond")];
   }
 
@@ -54,12 +53,12 @@ export class Trimming {
     this.kept[which] = Math.min(Math.max(mm, LEAST_MM), this.most(which));
     this.isPulled = true;
     this.handles.forEach((handle) => handle.which === which && handle.say());
-    this.host.told();
+    this.page.picture.stage?.redraw();
   }
 
   release(which) {
     if (!this.isPulled) return;
     this.isPulled = false;
-    this.host.chosen({ [which]: Number(this.kept[which].toFixed(2)) });
+    this.page.choose({ [which]: Number(this.kept[which].toFixed(2)) });
   }
 }
