@@ -3,6 +3,8 @@ import { label, makeHandle } from "./handles.js";
 
 const STEP_MM = 0.5;
 const LEAST_MM = 1;
+/** Way along the artery from the sac to a cut. */
+const WAY = { upstream_mm: -1, downstream_mm: 1 };
 
 export class Trimming {
   constructor(page) {
@@ -27,13 +29,13 @@ export class Trimming {
   }
 
   most(which) {
-    return which === "upstream_mm" ? this.middle : this.axis.length - this.middle;
+    return WAY[which] < 0 ? this.middle : this.axis.length - this.middle;
   }
 
   handle(which, kind, word) {
     const element = makeHandle(`${kind} cut`, `Cut ${word} the sac`, {
-      pulled: (event) => this.keep(which, this.reach(which, this.axis.under(event, this.place(which)))),
-      nudged: ([right, up]) => this.keep(which, this.kept[which] + (which === "upstream_mm" ? -STEP_MM : STEP_MM) * (right + up)),
+      pulled: (event) => this.keep(which, WAY[which] * (this.axis.under(event, this.place(which)) - this.middle)),
+      nudged: ([right, up]) => this.keep(which, this.kept[which] + WAY[which] * STEP_MM * (right + up)),
       released: () => this.release(which),
     });
     const say = () => label(element, `${this.kept[which].toFixed(1)} mm ${word} the sac`);
@@ -42,11 +44,7 @@ export class Trimming {
 
   /** Abscissa of a cut. */
   place(which) {
-    return which === "upstream_mm" ? this.middle - this.kept[which] : this.middle + this.kept[which];
-  }
-
-  reach(which, mm) {
-    return which === "upstream_mm" ? this.middle - mm : mm - this.middle;
+    return this.middle + WAY[which] * this.kept[which];
   }
 
   keep(which, mm) {
