@@ -9,6 +9,7 @@ import time
 from dataclasses import asdict, replace
 from importlib.resources import files
 from pathlib import Path
+from typing import get_args
 
 import app_case
 import numpy as np
@@ -29,8 +30,9 @@ from vstent.devices.catalogue import find_design
 from vstent.devices.stent import Landing
 from vstent.devices.treatment import read_treatment, with_device
 from vstent.errors import ReadError
+from vstent.fields import stated
 from vstent.flow.case import FlowField, Phase
-from vstent.flow.settings import Blood, CarreauYasuda, FlowSettings, Numerics, Waveform
+from vstent.flow.settings import Blood, CarreauYasuda, FlowSettings, Numerics, Outlets, Waveform
 from vstent.geometry.vessel import Anatomy
 from vstent.io.archive import load_data, save_data
 from vstent.io.dicom_writer import write_dicom
@@ -714,6 +716,11 @@ def test_the_interface_is_described_and_its_page_needs_no_network(client):
     assert all(verb["summary"] for verbs in api["paths"].values() for verb in verbs.values())
     for path in ("/api/docs", "/assets/docs.js", "/", "/assets/app.css"):
         assert "https://" not in client.get(path).text
+    flow = api["components"]["schemas"]["FlowChoice"]["properties"]  # the page takes its lists and limits from here
+    limits = stated(FlowSettings)["numerics.cell_size_mm"].limits
+    assert (flow["cell_size_mm"]["minimum"], flow["cell_size_mm"]["maximum"]) == (limits.low, limits.high)
+    assert flow["inflow_mL_s"]["exclusiveMinimum"] == 0.0
+    assert flow["outlets"]["enum"] == list(get_args(Outlets))
 
 
 def test_uncertainty_is_told_in_the_order_of_the_treatments_with_its_causes():
@@ -781,6 +788,7 @@ FIRST_REQUESTS = """
 import socket, sys, threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import get_args
 import httpx, uvicorn
 from vstent.app.cases import Cases
 from vstent.app.workspace import Workspace

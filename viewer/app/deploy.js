@@ -7,15 +7,15 @@ const STEP_MM = 0.2;
 const REST_MS = 400; // the bands are asked for when the device has lain still for so long, so that a drag never waits for them
 
 export class Deploying {
-  /** @param host {path, picture, along, section, colour(), choice(name), chosen(name, id, centerMm), told(manifest, isWhole), banded(sheet or null), failed} */
-  constructor(host) {
-    this.host = host;
+  /** @param page the page; its picture and its charts are built before */
+  constructor(page) {
+    this.page = page;
     this.name = this.id = null; // of the treatment, and of the implant in it
     this.place = null;
-    this.sketches = new Newest((answer) => this.sketched(answer), host.failed);
-    this.whole = new Newest((answer) => this.deployed(answer), host.failed);
-    this.bands = new Newest((sheet) => !this.isDragging && host.banded(sheet), host.failed);
-    this.sections = new Newest((answer) => host.section.show(answer), () => {});
+    this.sketches = new Newest((answer) => this.sketched(answer), page.complain);
+    this.whole = new Newest((answer) => this.deployed(answer), page.complain);
+    this.bands = new Newest((sheet) => !this.isDragging && page.toldBands(sheet), page.complain);
+    this.sections = new Newest((answer) => page.section.show(answer), () => {});
     this.cursorMark = { element: make("i", { className: "cursor-mark" }), point: () => this.cursor !== undefined && this.axis.at(this.cursor) };
     this.handles = ["proximal", "distal"].map((end, i) => this.handle(end, i));
   }
@@ -37,22 +37,23 @@ export class Deploying {
 
   slide(anchor, mm) {
     this.wanted = mm;
-    if (!this.isDragging) this.host.banded(null);
+    if (!this.isDragging) this.page.toldBands(null);
     this.isDragging = true;
-    const wanted = { ...this.wantedNow(), colour: this.host.colour(), anchor, abscissa_mm: mm };
-    this.sketches.ask(() => postBinary(`${this.host.path()}/sketch`, wanted));
+    const wanted = { ...this.wantedNow(), colour: this.page.colour, anchor, abscissa_mm: mm };
+    this.sketches.ask(() => postBinary(`${this.page.path}/sketch`, wanted));
   }
 
   release() {
     this.wanted = undefined;
     if (!this.isDragging) return;
     this.isDragging = false;
-    this.host.chosen(this.name, this.id, this.atRest());
+    const [name, id] = [this.name, this.id];
+    this.page.choose(this.atRest().then((mm) => this.page.moved(name, id, Number(mm.toFixed(3)))));
   }
 
   /** The treatment in view as it is chosen, and the implant in it; nothing where it is not chosen any more. */
   wantedNow() {
-    const treatment = this.host.choice(this.name);
+    const treatment = this.page.view.choices.treatments.find(({ name }) => name === this.name);
     return treatment && { treatment, implant: this.id };
   }
 
@@ -69,47 +70,47 @@ export class Deploying {
 
   /** Show an implant as it is chosen: its treatment deployed, with its numbers. */
   show(name, id) {
-    if (name !== this.name || id !== this.id) this.host.along.set({ device: null });
+    if (name !== this.name || id !== this.id) this.page.along.set({ device: null });
     [this.name, this.id] = [name, id];
-    const wanted = { ...this.wantedNow(), colour: this.host.colour() };
-    this.whole.ask(() => postBinary(`${this.host.path()}/deployment`, wanted));
+    const wanted = { ...this.wantedNow(), colour: this.page.colour };
+    this.whole.ask(() => postBinary(`${this.page.path}/deployment`, wanted));
   }
 
   sketched(answer) {
     this.take(answer);
-    this.host.told(answer.manifest, false);
+    this.page.toldTreatment(answer.manifest, false);
   }
 
   deployed(answer) {
     if (this.isDragging) return;
     this.take(answer);
-    this.host.told(answer.manifest, true);
+    this.page.toldTreatment(answer.manifest, true);
     const wanted = this.wantedNow();
     clearTimeout(this.rest);
     this.rest = setTimeout(() => {
-      if (!this.isDragging && wanted) this.bands.ask(() => post(`${this.host.path()}/bands`, wanted));
+      if (!this.isDragging && wanted) this.bands.ask(() => post(`${this.page.path}/bands`, wanted));
     }, REST_MS);
   }
 
   take(answer) {
     this.place = answer.manifest;
-    this.host.picture.put(answer);
+    this.page.picture.put(answer);
     this.handles.forEach(({ element }, i) => {
       label(element, `${this.place.ends_mm[i].toFixed(1)} mm`);
     });
     const { profile, ends_mm, ends_band_mm } = this.place;
-    this.host.along.set({ device: { profile, ends: ends_mm, bands: ends_band_mm } });
-    this.host.picture.stage?.redraw();
+    this.page.along.set({ device: { profile, ends: ends_mm, bands: ends_band_mm } });
+    this.page.picture.stage?.redraw();
   }
 
   /** Put the section at an abscissa. */
   look(mm) {
     if (mm === null || !this.axis) return;
     this.cursor = mm;
-    this.host.along.set({ cursor: mm });
-    this.host.picture.stage?.redraw();
+    this.page.along.set({ cursor: mm });
+    this.page.picture.stage?.redraw();
     const query = new URLSearchParams({ abscissa_mm: mm.toFixed(3) });
     if (this.wantedNow() && !this.isDragging) for (const [key, value] of [["treatment", this.name], ["implant", this.id]]) query.set(key, value);
-    this.sections.ask(() => get(`${this.host.path()}/section?${query}`));
+    this.sections.ask(() => get(`${this.page.path}/section?${query}`));
   }
 }

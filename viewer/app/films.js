@@ -18,9 +18,8 @@ function contained(canvas) {
 }
 
 export class Films {
-  /** @param host {path(), title(name), failed(problem)} */
-  constructor(host) {
-    this.host = host;
+  constructor(page) {
+    this.page = page;
     this.moment = 0;
     this.hasWires = false;
     this.direction = "";
@@ -39,9 +38,13 @@ export class Films {
     });
     this.saveChart = chartButton("contrast over time", this.chart, () => this.draw());
     this.strip = [make("div", { className: "film-time" }, [this.play, this.slider, this.clock, save]), this.chart];
-    this.newest = new Newest((answer) => this.take(answer), (problem) => host.failed(problem));
+    this.newest = new Newest((answer) => this.take(answer), page.complain);
     this.listen();
     new ResizeObserver(() => this.draw()).observe(this.chart);
+  }
+
+  title(name) {
+    return name === "bare" ? "Before" : this.page.names.treatment(name);
   }
 
   get hasFilm() {
@@ -60,7 +63,7 @@ export class Films {
     const query = new URLSearchParams({ wires: this.hasWires });
     if (direction) query.set("view", direction);
     if (moment !== null) query.set("moment", moment);
-    this.newest.ask(() => getBinary(`${this.host.path()}/angiogram?${query}`));
+    this.newest.ask(() => getBinary(`${this.page.path}/angiogram?${query}`));
   }
 
   take({ manifest, buffer }) {
@@ -75,7 +78,7 @@ export class Films {
     this.moment = Math.min(this.moment, this.times.length - 1);
     this.layout();
     this.look(this.moment);
-    this.host.changed?.();
+    if (this.page.view) this.page.renderFilms();
   }
 
   layout() {
@@ -85,7 +88,7 @@ export class Films {
       this.names = names;
       this.canvases = this.frames.map(() => make("canvas", { className: "film-canvas" }));
       this.labels = this.frames.map(() => make("span"));
-      const figure = ([id], k) => make("figure", { className: "film-pane" }, [make("figcaption", {}, [make("strong", {}, [this.host.title(id)]), this.labels[k]]), this.canvases[k]]);
+      const figure = ([id], k) => make("figure", { className: "film-pane" }, [make("figcaption", {}, [make("strong", {}, [this.title(id)]), this.labels[k]]), this.canvases[k]]);
       this.panes.replaceChildren(...this.frames.map(figure));
     }
     for (const canvas of this.canvases) [canvas.width, canvas.height] = [width, height];
@@ -114,7 +117,7 @@ export class Films {
     const [width, height] = [this.chart.clientWidth, this.chart.clientHeight];
     if (!this.curves?.length || width < 60 || height < 50) return;
     const chosen = (time) => this.look(this.times.reduce((best, t, k) => (Math.abs(t - time) < Math.abs(this.times[best] - time) ? k : best), 0));
-    this.chart.replaceChildren(curvesChart(this.curves, this.times[this.moment], [width, height], (name) => this.host.title(name), chosen), this.saveChart);
+    this.chart.replaceChildren(curvesChart(this.curves, this.times[this.moment], [width, height], (name) => this.title(name), chosen), this.saveChart);
   }
 
   /** Play, in real time. */

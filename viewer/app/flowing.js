@@ -7,9 +7,8 @@ const EVERY_MS = 220;
 const NAMES = { neck_inflow_mL_s: ["Neck inflow", "mL/s", 1], sac_velocity_m_s: ["Mean sac velocity", "mm/s", 1000] };
 
 export class Flowing {
-  /** @param host {path(), picture, changed(), failed(problem)} */
-  constructor(host) {
-    this.host = host;
+  constructor(page) {
+    this.page = page;
     this.isOn = false;
     this.drawn = 0; // number of the streamlines that are in the picture
     this.box = make("input", { type: "checkbox", id: "live-flow", onChange: () => this.turn(this.box.checked) });
@@ -31,7 +30,7 @@ export class Flowing {
     this.expected = expected;
     if (document.hidden || expected === this.prepared) return;
     this.prepared = expected;
-    if (expected && !this.isOn) post(`${this.host.path()}/preview`).catch(() => {}); // it only saves time later
+    if (expected && !this.isOn) post(`${this.page.path}/preview`).catch(() => {}); // it only saves time later
   }
 
   /** The case is left: its process ends. */
@@ -42,7 +41,7 @@ export class Flowing {
   }
 
   release() {
-    drop(`${this.host.path()}/preview`).catch(() => {});
+    drop(`${this.page.path}/preview`).catch(() => {});
   }
 
   turn(isOn) {
@@ -54,7 +53,7 @@ export class Flowing {
       this.say("Starting …");
       this.watch();
     }
-    this.host.changed();
+    if (this.page.view) this.page.renderScene();
   }
 
   /** Whether the page looks at the flow: only then it is computed. */
@@ -67,7 +66,7 @@ export class Flowing {
   /** Take the streamlines out of the picture. */
   forget() {
     this.drawn = 0;
-    this.host.picture.stage?.drop(({ id, pane }) => id === "streamlines" && pane === "");
+    this.page.picture.stage?.drop(({ id, pane }) => id === "streamlines" && pane === "");
   }
 
   async watch() {
@@ -76,7 +75,7 @@ export class Flowing {
     while (this.isOn && this.watched && !document.hidden) {
       const began = performance.now();
       try {
-        this.take(await getBinary(`${this.host.path()}/preview?seen=${this.drawn}`));
+        this.take(await getBinary(`${this.page.path}/preview?seen=${this.drawn}`));
       } catch (problem) {
         this.fail(problem);
       }
@@ -89,7 +88,7 @@ export class Flowing {
   fail(problem) {
     this.turn(false);
     this.release();
-    this.host.failed(problem);
+    this.page.complain(problem);
   }
 
   say(words) {
@@ -99,7 +98,7 @@ export class Flowing {
   take({ manifest, buffer }) {
     if (!this.isOn || !this.watched) return;
     if (manifest.error) return this.fail(new Error(manifest.error));
-    if (manifest.layers.length) this.host.picture.put({ manifest, buffer });
+    if (manifest.layers.length) this.page.picture.put({ manifest, buffer });
     this.drawn = manifest.drawn;
     const { fraction, is_stale, is_settled, values, reductions, history, error_points } = manifest;
     this.element.classList.toggle("stale", is_stale);

@@ -20,7 +20,7 @@ export class Imaging {
         this.views = answer.manifest.views;
         page.renderScene();
       },
-      (problem) => page.complain(problem),
+      page.complain,
     );
     this.lines = svg("svg", { class: "cross-mark", width: 1, height: 1, "aria-hidden": "true" });
     this.cross = { element: this.lines, point: () => this.drawCross() };
@@ -35,16 +35,7 @@ export class Imaging {
     const scan = await get(`${page.path}/image`);
     if (this.key !== grid) return;
     page.scan = scan;
-    this.slices = new Slices({
-      path: () => page.path,
-      box: this.box,
-      seeded: (point, isLumen) => (isLumen ? page.setSeed(point) : page.tell("There is no lumen at that point: click a bright one.")),
-      cropped: (corners) => page.choose({ crop_mm: corners && corners.map((point) => point.map((x) => Number(x.toFixed(3)))) }),
-      looked: () => page.picture.stage?.redraw(),
-      told: () => page.picture.stage?.redraw(),
-      alone: (isAlone) => page.frame.classList.toggle("one-slice", isAlone),
-      failed: (problem) => page.complain(problem),
-    });
+    this.slices = new Slices(this);
     this.box.replaceChildren(...this.slices.elements);
     this.slices.show(scan);
     this.follow(page.view);
@@ -79,7 +70,7 @@ export class Imaging {
     const crop = JSON.stringify(crop_mm);
     if (this.cropKey !== undefined && crop !== this.cropKey) {
       this.page.scan.proposed_threshold = undefined;
-      this.propose(this.key).catch((problem) => this.page.complain(problem));
+      this.propose(this.key).catch(this.page.complain);
     }
   }
 
@@ -87,6 +78,10 @@ export class Imaging {
   showThreshold(threshold) {
     this.slices?.setThreshold(threshold);
     this.surfaces.ask(() => getBinary(`${this.page.path}/image/surface?threshold=${threshold}`));
+  }
+
+  redraw() {
+    this.page.picture.stage?.redraw();
   }
 
   /** A point of the surface was clicked: the slices turn to it, or it becomes the seed. */

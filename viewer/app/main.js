@@ -37,6 +37,7 @@ const WORDS = { todo: "not done yet", running: "at work", done: "done", stale: "
 class Page {
   constructor(root) {
     this.root = root;
+    this.complain = this.complain.bind(this);
     this.toasts = make("div", { className: "toasts", role: "status", ariaLive: "polite" });
     this.root.append(this.toasts);
     listenForTips(document.body);
@@ -51,7 +52,7 @@ class Page {
   }
 
   async begin() {
-    this.catalogue = await get("/api/catalogue").catch((problem) => this.complain(problem)) || [];
+    this.catalogue = await get("/api/catalogue").catch(this.complain) || [];
     this.fields = {};
     get("/api/openapi.json").then(({ components }) => this.show({ fields: components.schemas.FlowChoice.properties })).catch(() => {}); // without limits the server still checks
     this.names = new Names(this.catalogue, () => this.view?.choices.treatments || []);
@@ -75,7 +76,7 @@ class Page {
     this.frame?.remove();
     this.frame = make("div", { className: "page" }, [
       make("header", {}, [this.brand(), make("div", { className: "spring" }), this.badge()]),
-      startPage((id) => (location.hash = id), (problem) => this.complain(problem)),
+      startPage((id) => (location.hash = id), this.complain),
     ]);
     this.root.prepend(this.frame);
     document.title = "vstent";
@@ -137,42 +138,20 @@ class Page {
 
   build() {
     this.frame?.remove();
-    this.picture = new Picture({
-      complain: (problem) => this.complain(problem),
-      kept: () => this.view?.choices.views ?? [],
-      keep: (views) => this.choose({ views }),
-      keepRanges: (ranges) => this.choose({ ranges }),
-    });
+    this.picture = new Picture(this);
     this.ranking = new Ranking(this);
     this.sacLabel = new SacLabel(this.picture);
     this.along = new AlongChart();
     this.section = new SectionChart();
-    this.flowing = new Flowing({ path: () => this.path, picture: this.picture, changed: () => this.view && this.renderScene(), failed: (problem) => this.complain(problem) });
-    this.deploying = new Deploying({
-      path: () => this.path,
-      picture: this.picture,
-      along: this.along,
-      section: this.section,
-      colour: () => this.colour,
-      choice: (name) => this.view.choices.treatments.find((treatment) => treatment.name === name),
-      chosen: (name, id, center) => this.choose(center.then((mm) => this.moved(name, id, Number(mm.toFixed(3))))),
-      told: (manifest, isWhole) => this.toldTreatment(manifest, isWhole),
-      banded: (sheet) => this.toldBands(sheet),
-      failed: (problem) => this.complain(problem),
-    });
-    this.neck = new Neck({
-      path: () => this.path,
-      picture: this.picture,
-      chosen: (curve) => this.choose({ neck_mm: curve.map((point) => point.map((x) => Number(x.toFixed(3)))) }),
-      told: (neck) => this.toldNeck(neck),
-      failed: (problem) => this.complain(problem),
-    });
+    this.flowing = new Flowing(this);
+    this.deploying = new Deploying(this);
+    this.neck = new Neck(this);
     this.portrait = new Portrait(this);
-    this.films = new Films({ path: () => this.path, title: (name) => (name === "bare" ? "Before" : this.names.treatment(name)), changed: () => this.view && this.renderFilms(), failed: (problem) => this.complain(problem) });
-    this.trimming = new Trimming({ chosen: (changes) => this.choose(changes), told: () => this.picture.stage?.redraw() });
+    this.films = new Films(this);
+    this.trimming = new Trimming(this);
     this.along.chosen = (mm) => this.deploying.look(mm);
     this.imaging = new Imaging(this);
-    this.moments = new Newest(() => {}, (problem) => this.complain(problem));
+    this.moments = new Newest(() => {}, this.complain);
     this.stepper = make("nav", { className: "stepper", ariaLabel: "Steps" });
     this.undoButton = button("↶", () => this.stepBack("undo"), { className: "icon", title: "Undo (Ctrl+Z)", ariaLabel: "Undo" });
     this.redoButton = button("↷", () => this.stepBack("redo"), { className: "icon", title: "Redo (Ctrl+Shift+Z)", ariaLabel: "Redo" });
@@ -249,7 +228,7 @@ class Page {
     const grid = JSON.stringify([view.id, view.choices.shape, view.choices.spacing_mm]);
     if (view.is_scan && !view.wants_grid && this.step === "image" && this.scanKey !== grid) {
       this.scanKey = grid;
-      this.imaging.load(grid).catch((problem) => this.complain(problem));
+      this.imaging.load(grid).catch(this.complain);
     }
     if (view.has_anatomy && this.anatomyKey !== view.anatomy) this.loadAnatomy();
     const read = JSON.stringify([view.choices.units, view.choices.frame]);
@@ -509,7 +488,7 @@ class Page {
     if (!job) return this.work.replaceChildren();
     const bar = make("i", { style: { width: `${Math.max(2, 100 * job.fraction)}%` } });
     const words = make("div", { className: "work-words" }, [make("b", {}, [job.stage ? this.spoken(job.stage) : "Starting"]), make("span", {}, [progressWords(job) || "…"])]);
-    const stop = button("Cancel", () => drop(`${this.path}/jobs`).catch((problem) => this.complain(problem)));
+    const stop = button("Cancel", () => drop(`${this.path}/jobs`).catch(this.complain));
     const done = job.finished.map(({ stage }) => this.spoken(stage));
     const said = make("p", { className: "hint" }, [done.length ? `Done: ${done.join(", ")}.` : "The work continues when this tab is closed."]);
     redraw(this.work, words, make("div", { className: "bar", role: "progressbar", ariaValueNow: String(Math.round(100 * job.fraction)) }, [bar]), stop, said);
@@ -576,7 +555,7 @@ class Page {
     const save = chartButton("inlet waveform", box);
     const draw = () => box.replaceChildren(save, pulseChart(this.pulse, this.view.choices.flow.is_pulsatile, this.times || [], this.moment, shown));
     if (this.pulse) draw();
-    else get(`/api/waveform?case_id=${this.view.id}`).then((pulse) => ((this.pulse = pulse), draw())).catch((problem) => this.complain(problem));
+    else get(`/api/waveform?case_id=${this.view.id}`).then((pulse) => ((this.pulse = pulse), draw())).catch(this.complain);
     return box;
   }
 

@@ -5,17 +5,16 @@ import { label, makeHandle } from "./handles.js";
 const STEP_PX = 4;
 
 export class Neck {
-  /** @param host {path(), picture, chosen(curve), told(neck), failed} */
-  constructor(host) {
-    this.host = host;
+  constructor(page) {
+    this.page = page;
     this.curve = [];
     this.handles = [];
-    this.moves = new Newest((answer) => this.take(answer), host.failed);
+    this.moves = new Newest((answer) => this.take(answer), page.complain);
   }
 
   /** Begin with a curve of points [[x, y, z], ...] and so many handles. */
   set(curve, count) {
-    const given = JSON.stringify([this.host.path(), curve]);
+    const given = JSON.stringify([this.page.path, curve]);
     if (this.isPulled || given === this.given) return;
     this.given = given;
     this.curve = curve;
@@ -26,7 +25,7 @@ export class Neck {
   }
 
   ask(more) {
-    return postBinary(`${this.host.path()}/neck`, { curve_mm: this.curve, ...more });
+    return postBinary(`${this.page.path}/neck`, { curve_mm: this.curve, ...more });
   }
 
   /** Where a handle lies. */
@@ -36,9 +35,9 @@ export class Neck {
 
   handle(i) {
     const element = makeHandle("small", `Point ${i + 1} of the neck`, {
-      pulled: (event) => this.pull(i, this.host.picture.where(event)),
+      pulled: (event) => this.pull(i, this.page.picture.where(event)),
       nudged: ([right, up]) => {
-        const [x, y] = this.host.picture.onScreen(this.at(i));
+        const [x, y] = this.page.picture.onScreen(this.at(i));
         this.pull(i, [x + STEP_PX * right, y - STEP_PX * up]);
       },
       released: () => this.release(),
@@ -48,7 +47,7 @@ export class Neck {
 
   /** Bring a handle to where the wall is seen at a pixel, on the side of the vessel that it is on. */
   pull(i, place) {
-    const to = this.host.picture.onWall(place, "lumen", this.at(i));
+    const to = this.page.picture.onWall(place, "lumen", this.at(i));
     if (!to) return;
     this.isPulled = true;
     this.moves.ask(() => this.ask({ handle: i, to_mm: to }));
@@ -56,9 +55,9 @@ export class Neck {
 
   take({ manifest, buffer }) {
     this.curve = manifest.neck.curve_mm;
-    this.host.picture.put({ manifest, buffer });
+    this.page.picture.put({ manifest, buffer });
     this.handles.forEach(({ element }) => label(element, `${manifest.neck.area_mm2.toFixed(1)} mm²`));
-    this.host.told(manifest.neck);
+    this.page.toldNeck(manifest.neck);
   }
 
   release() {
@@ -66,7 +65,7 @@ export class Neck {
     const settle = () => {
       if (this.moves.isBusy) return setTimeout(settle, 15);
       this.isPulled = false;
-      this.host.chosen(this.curve);
+      this.page.choose({ neck_mm: this.curve.map((point) => point.map((x) => Number(x.toFixed(3)))) });
     };
     settle();
   }

@@ -14,9 +14,8 @@ const NARROW = 900;
 const EMPTY = { scales: [], layers: [], views: [], fade: 2 };
 
 export class Picture {
-  /** @param host {complain(problem), kept(): views that were saved, keep(views), keepRanges(ranges)} */
-  constructor(host) {
-    this.host = host;
+  constructor(page) {
+    this.page = page;
     this.canvas = make("canvas", { className: "viewer-canvas", ariaHidden: "true" });
     this.grid = make("div", { className: "viewer-panes" });
     this.marks = make("div", { className: "marks" });
@@ -127,10 +126,18 @@ export class Picture {
         return chip;
       });
     const views = this.views.map(({ id }, i) => button(VIEWS[id][0], () => this.look(id), { className: "chip view", title: `${VIEWS[id][1]} (key ${i + 1})` }));
-    const own = this.stage && this.views.length ? [...this.host.kept().map((view) => this.keptChip(view)), this.keepChip(), ...(this.stage.isOriented === false ? [] : [this.carm])] : [];
+    const own = this.stage && this.views.length ? [...this.savedViews.map((view) => this.keptChip(view)), this.keepChip(), ...(this.stage.isOriented === false ? [] : [this.carm])] : [];
     const save = this.stage ? [this.save] : [];
     redraw(this.toolbar, make("div", { className: "chips" }, layers), make("div", { className: "chips" }, [...views, ...own, ...save]));
     this.makeRoom();
+  }
+
+  get savedViews() {
+    return this.page.view?.choices.views ?? [];
+  }
+
+  saveViews(views) {
+    this.page.choose({ views });
   }
 
   /** A view that was saved: it is looked at again, or forgotten. */
@@ -139,7 +146,7 @@ export class Picture {
       this.lastLook = null;
       this.stage.orbit.go({ axes, center: center_mm, distance: distance_mm });
     };
-    const forget = () => this.host.keep(this.host.kept().filter((view) => view.name !== name));
+    const forget = () => this.saveViews(this.savedViews.filter((view) => view.name !== name));
     return make("span", { className: "kept-view" }, [
       button(name, look, { className: "chip view", title: "Saved view" }),
       button("×", forget, { className: "chip", title: "Forget this view", ariaLabel: `Forget the view ${name}` }),
@@ -150,9 +157,9 @@ export class Picture {
   keepChip() {
     const keep = async () => {
       const { axes, center, distance } = this.stage.orbit.stand;
-      const kept = this.host.kept();
+      const kept = this.savedViews;
       const name = await ask({ title: "Save this view", words: ["It is kept with the case, and offered beside the other views."], field: "Name", value: `View ${kept.length + 1}`, button: "Save view" });
-      if (name) this.host.keep([...kept.filter((view) => view.name !== name), { name: name.slice(0, 40), axes, center_mm: center, distance_mm: distance }]);
+      if (name) this.saveViews([...kept.filter((view) => view.name !== name), { name: name.slice(0, 40), axes, center_mm: center, distance_mm: distance }]);
     };
     return button("+", keep, { className: "chip", title: "Save this view under a name", ariaLabel: "Save this view" });
   }
@@ -164,7 +171,7 @@ export class Picture {
       this.stage.orbit.go({ axes: axesOf(fromWords(this.carm.value)), center, distance });
       this.lastLook = null;
     } catch (problem) {
-      this.host.complain(problem);
+      this.page.complain(problem);
     }
     this.carm.blur();
     this.stage.redraw();
@@ -202,7 +209,7 @@ export class Picture {
       if (range === undefined) return;
       const others = this.ranges.filter((one) => one.scale !== scale.id);
       this.setRanges(range ? [...others, { scale: scale.id, ...range }] : others);
-      this.host.keepRanges(this.ranges);
+      this.page.choose({ ranges: this.ranges });
     };
     return button(stage.ranges[scale.id] ? "range (own)" : "range", change, { className: "link range", title: "Change the range of these colours", ariaLabel: `Range of ${scale.title}` });
   }

@@ -43,7 +43,7 @@ export class Ranking {
     else {
       this.key = key;
       if (!this.found) this.box.replaceChildren(make("p", { className: "hint" }, ["Ranking …"]));
-      get(`${this.page.path}/ranking`).then((found) => this.change({ found })).catch((problem) => this.page.complain(problem));
+      get(`${this.page.path}/ranking`).then((found) => this.change({ found })).catch(this.page.complain);
     }
     return this.box;
   }

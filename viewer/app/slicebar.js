@@ -46,12 +46,12 @@ export class SliceBar {
     return saveButton({
       name: "slices",
       get element() {
-        return slices.host.box;
+        return slices.imaging.box;
       },
       ground: "#10171b",
       shape: (wide) => {
         const { visible } = slices;
-        slices.host.box.style.setProperty("--along", isRow(wide) ? "row" : "column");
+        slices.imaging.box.style.setProperty("--along", isRow(wide) ? "row" : "column");
         return visible.length === 1 ? visible[0].box[1] / visible[0].box[0] : isRow(wide) ? 0.4 : 2.2;
       },
       lay: () => slices.paint(),

@@ -11,9 +11,10 @@ const KEPT = 90;
 const AHEAD = 2;
 
 export class Slices {
-  /** @param host {path, box, seeded(mm), cropped(corners or null), looked(mm), told(), device(), failed} */
-  constructor(host) {
-    this.host = host;
+  /** @param imaging the step in which they are shown */
+  constructor(imaging) {
+    this.imaging = imaging;
+    this.page = imaging.page;
     this.threshold = null;
     this.on = { threshold: true, lumen: true, parent: false, sac: true, neck: true, wires: true };
     this.tool = "cross";
@@ -27,8 +28,8 @@ export class Slices {
     this.greys = new Uint32Array(65536);
     this.kept = new Map();
     this.views = [0, 1, 2].map((axis) => new SliceView(axis, this));
-    this.lines = this.views.map(() => new Newest((answer) => answer && this.arrived(answer), host.failed));
-    this.outlineLines = this.views.map(() => new Newest((answer) => answer && this.outlined(answer), host.failed));
+    this.lines = this.views.map(() => new Newest((answer) => answer && this.arrived(answer), this.page.complain));
+    this.outlineLines = this.views.map(() => new Newest((answer) => answer && this.outlined(answer), this.page.complain));
     this.views.forEach((view) => new Handling(view, this));
     this.bar = new SliceBar(this);
     this.elements = [this.bar.element, ...this.views.map(({ element }) => element)];
@@ -74,7 +75,7 @@ export class Slices {
     this.cross = index.map((place, axis) => Math.min(Math.max(place, 0), this.scan.shape[axis] - 1));
     for (const view of this.views) this.load(view);
     this.bar.say();
-    this.host.looked(this.crossMm);
+    this.imaging.redraw();
   }
 
   get crossMm() {
@@ -137,7 +138,7 @@ export class Slices {
     const { scan } = this;
     let plane = this.kept.get(key);
     if (!plane) {
-      const { manifest, buffer } = await getBinary(`${this.host.path()}/image/slice?axis=${view.axis}&index=${index}&slab=${this.slabOf(view)}${this.asked}`);
+      const { manifest, buffer } = await getBinary(`${this.page.path}/image/slice?axis=${view.axis}&index=${index}&slab=${this.slabOf(view)}${this.asked}`);
       plane = { width: manifest.width, height: manifest.height, values: integers(buffer, manifest.values) };
       if (scan !== this.scan) return null;
       this.keep(key, plane);
@@ -196,7 +197,7 @@ export class Slices {
     const wires = treatment && this.on.wires ? `&treatment=${encodeURIComponent(treatment)}` : "";
     this.outlineLines[view.axis].ask(async () => {
       if (index !== view.index) return null;
-      return { view, index, found, answer: await getBinary(`${this.host.path()}/image/outlines?axis=${view.axis}&index=${index}${wires}${this.asked}`) };
+      return { view, index, found, answer: await getBinary(`${this.page.path}/image/outlines?axis=${view.axis}&index=${index}${wires}${this.asked}`) };
     });
   }
 
@@ -249,7 +250,7 @@ export class Slices {
     for (const view of this.views) view.area.dataset.tool = tool;
     this.bar.renderTools();
     this.paint();
-    this.host.told();
+    this.imaging.redraw();
   }
 
   toggle(name) {
@@ -271,7 +272,8 @@ export class Slices {
   /** Choose a seed: an index of the volume. */
   plant(view, index) {
     const isLumen = this.threshold === null || (view.valueAt(index) ?? -Infinity) >= this.threshold;
-    this.host.seeded(toMm(this.scan.affine_mm, index), isLumen);
+    if (isLumen) this.page.setSeed(toMm(this.scan.affine_mm, index));
+    else this.page.tell("There is no lumen at that point: click a bright one.");
   }
 
   measure(view, ends, isNew) {
@@ -304,7 +306,7 @@ export class Slices {
     this.crop = found ? [0, 1].map((end) => found[0].map((_, axis) => Math[end ? "max" : "min"](found[0][axis], found[1][axis]))) : null;
     this.bar.renderTools();
     this.paint();
-    this.host.told();
+    this.imaging.redraw();
   }
 
   /** Move one edge of the crop box. */
@@ -314,12 +316,13 @@ export class Slices {
     box[end][axis] = Math.min(Math.max(Math.round(place), least), most);
     this.crop = box;
     this.paint();
-    this.host.told();
+    this.imaging.redraw();
   }
 
   letCropGo() {
     this.bar.renderTools();
-    this.host.cropped(this.isCropped ? this.crop.map((corner) => toMm(this.file.affine_mm, corner)) : null);
+    const rounded = (corner) => toMm(this.file.affine_mm, corner).map((x) => Number(x.toFixed(3)));
+    this.page.choose({ crop_mm: this.isCropped ? this.crop.map(rounded) : null });
   }
 
   // -- the views together ---------------------------------------------------------------------------------------------
@@ -340,7 +343,7 @@ export class Slices {
   maximise(view) {
     const isAlone = view.element.classList.toggle("alone");
     for (const one of this.views) if (one !== view) one.element.classList.remove("alone");
-    this.host.alone(isAlone);
+    this.page.frame.classList.toggle("one-slice", isAlone);
   }
 
   /** Index in the file of an index of the slices. */

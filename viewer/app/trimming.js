@@ -3,11 +3,12 @@ import { label, makeHandle } from "./handles.js";
 
 const STEP_MM = 0.5;
 const LEAST_MM = 1;
+/** Way along the artery from the sac to a cut. */
+const WAY = { upstream_mm: -1, downstream_mm: 1 };
 
 export class Trimming {
-  /** @param host {chosen({upstream_mm | downstream_mm}), told(which, mm)} */
-  constructor(host) {
-    this.host = host;
+  constructor(page) {
+    this.page = page;
     this.handles = [this.handle("upstream_mm", "proximal", "before"), this.handle("downstream_mm", "distal", "beyond")];
   }
 
@@ -28,13 +29,13 @@ export class Trimming {
   }
 
   most(which) {
-    return which === "upstream_mm" ? this.middle : this.axis.length - this.middle;
+    return WAY[which] < 0 ? this.middle : this.axis.length - this.middle;
   }
 
   handle(which, kind, word) {
     const element = makeHandle(`${kind} cut`, `Cut ${word} the sac`, {
-      pulled: (event) => this.keep(which, this.reach(which, this.axis.under(event, this.place(which)))),
-      nudged: ([right, up]) => this.keep(which, this.kept[which] + (which === "upstream_mm" ? -STEP_MM : STEP_MM) * (right + up)),
+      pulled: (event) => this.keep(which, WAY[which] * (this.axis.under(event, this.place(which)) - this.middle)),
+      nudged: ([right, up]) => this.keep(which, this.kept[which] + WAY[which] * STEP_MM * (right + up)),
       released: () => this.release(which),
     });
     const say = () => label(element, `${this.kept[which].toFixed(1)} mm ${word} the sac`);
@@ -43,23 +44,19 @@ export class Trimming {
 
   /** Abscissa of a cut. */
   place(which) {
-    return which === "upstream_mm" ? this.middle - this.kept[which] : this.middle + this.kept[which];
-  }
-
-  reach(which, mm) {
-    return which === "upstream_mm" ? this.middle - mm : mm - this.middle;
+    return this.middle + WAY[which] * this.kept[which];
   }
 
   keep(which, mm) {
     this.kept[which] = Math.min(Math.max(mm, LEAST_MM), this.most(which));
     this.isPulled = true;
     this.handles.forEach((handle) => handle.which === which && handle.say());
-    this.host.told();
+    this.page.picture.stage?.redraw();
   }
 
   release(which) {
     if (!this.isPulled) return;
     this.isPulled = false;
-    this.host.chosen({ [which]: Number(this.kept[which].toFixed(2)) });
+    this.page.choose({ [which]: Number(this.kept[which].toFixed(2)) });
   }
 }

@@ -154,14 +154,7 @@ def statuses(state: State, at_work: str, lost: Set[str]) -> dict[str, Status]:
 
 
 class Case:
-    """A case folder that several browser tabs may read and change, one change at a time.
-
-    Parameters
-    ----------
-    case_id : name of the case in URLs.
-    folder : the case folder.
-    state : its stored state.
-    """
+    """A case folder that several browser tabs may read and change, one change at a time; `id` is its name in URLs."""
 
     def __init__(self, case_id: str, folder: Path, state: State) -> None:
         self.id, self.folder = case_id, folder
@@ -188,12 +181,7 @@ class Case:
         return self.folder / self._state.input
 
     def change(self, revision: int, choices: Choices) -> State:
-        """Replace the choices.
-
-        Parameters
-        ----------
-        revision : revision on which the change is based.
-        choices : all choices after the change.
+        """Replace the choices, based on a revision.
 
         Raises
         ------
@@ -317,14 +305,7 @@ class Cases:
             return self._cases[case_id]
 
     def create(self, name: str, folder: Path | None = None, **known: Any) -> Case:
-        """Create a case.
-
-        Parameters
-        ----------
-        name : display name.
-        folder : the case folder; None: a new folder in the workspace.
-        known : further fields of the state.
-        """
+        """Create a case under a display name, with further fields of its state; without a folder in a new one."""
         with self._lock:
             case_id = free = identifier(name)
             count = 1

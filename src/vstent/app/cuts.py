@@ -8,7 +8,6 @@ from vstent.flow.case import FlowField
 from vstent.flow.sampling import is_blood, values_at
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy
-from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.reporting.scene import MeshLayer, views_of
 
 STEP_CELLS: Final = 0.6
@@ -16,14 +15,7 @@ STEP_CELLS: Final = 0.6
 
 
 def cut(pane: str, field: FlowField, anatomy: Anatomy) -> MeshLayer:
-    """Return the speed on the plane of the profile view, through the center of the sac or, without a sac, of the axis.
-
-    Parameters
-    ----------
-    pane : name of the pane that shows the cut.
-    field : the flow.
-    anatomy : vessel, parent artery and sacs.
-    """
+    """Return the speed on the plane of the profile view, through the center of the sac, or else of the axis."""
     right, up = views_of(anatomy)[0].axes[:2]
     sacs = anatomy.aneurysms
     middle = sacs[0].sac.vertices_mm.mean(axis=0) if sacs else anatomy.parent.axis.points_mm.mean(axis=0)
@@ -33,17 +25,11 @@ def cut(pane: str, field: FlowField, anatomy: Anatomy) -> MeshLayer:
     columns, rows = np.meshgrid(*ticks, indexing="ij")
     points_mm = middle + columns[..., None] * right + rows[..., None] * up
     speed = np.linalg.norm(values_at(field, points_mm.reshape(-1, 3))[0], axis=1)
-    surface, used = _where_blood_is(points_mm, is_blood(field, points_mm.reshape(-1, 3)))
-    return MeshLayer("slice", pane, (0.5, 0.5, 0.5), surface, scale="speed", values=speed[used])
-
-
-def _where_blood_is(points_mm: Floats, is_blood: Bools) -> tuple[Surface, Ints]:
-    """Return the triangles of a grid of points (n, m, 3) with all corners in blood, and the indices of their points."""
+    # Triangles of the grid with all corners in blood.
     n, m = points_mm.shape[:2]
-    number = np.arange(n * m).reshape(n, m)
-    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
-    quads = np.stack([a, b, c, d], axis=-1).reshape(-1, 4)
-    quads = quads[is_blood[quads].all(axis=1)]
-    faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    used, compact = np.unique(faces, return_inverse=True)
-    return Surface(points_mm.reshape(-1, 3)[used], compact.reshape(-1, 3)), used
+    number, points_mm = np.arange(n * m).reshape(n, m), points_mm.reshape(-1, 3)
+    quads = np.stack([number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]], axis=-1).reshape(-1, 4)
+    quads = quads[is_blood(field, points_mm)[quads].all(axis=1)]
+    used, corners = np.unique(np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]), return_inverse=True)
+    surface = Surface(points_mm[used], corners.reshape(-1, 3))
+    return MeshLayer("slice", pane, (0.5, 0.5, 0.5), surface, scale="speed", values=speed[used])

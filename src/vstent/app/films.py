@@ -58,7 +58,11 @@ def films_message(
     view = view_for(histories, settings)
     packer, panes, times_s = Packer(), [], np.zeros(0)
     projectors = projectors_of(view, histories)
-    window = max(_bound(projectors[name], history) for name, history in histories.items())
+    window = 1e-3  # absorption where the longest ray through a vessel is filled with the largest concentration
+    for name, history in histories.items():
+        length_mm = float(projectors[name](np.ones(history.stored.shape[1])).max())
+        most_mg_mL = float(history.value_mg_mL[int(history.stored.max(initial=0))])
+        window = max(window, length_mm * most_mg_mL * iodine_cm2_g(ENERGY_KEV) * CM2_G_PER)
     for name, history in histories.items():
         film = _film(history, projectors[name], moment)
         shadows = [wire_shadow(view, stent) for stent in stents.get(name, ())]
@@ -76,13 +80,6 @@ def films_message(
         "panes": panes,
     }
     return packer.framed(manifest | more)
-
-
-def _bound(projector: Projector, history: History) -> float:
-    """Return the absorption where the longest ray through the vessel is filled with the largest concentration."""
-    most_mg_mL = float(history.value_mg_mL[int(history.stored.max(initial=0))])
-    length_mm = projector(np.ones(history.stored.shape[1])).max()
-    return max(float(length_mm) * most_mg_mL * iodine_cm2_g(ENERGY_KEV) * CM2_G_PER, 1e-3)
 
 
 def _film(history: History, projector: Projector, moment: int | None) -> Film:

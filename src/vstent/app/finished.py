@@ -10,7 +10,6 @@ from pydantic import ValidationError
 from vstent.app.cases import STEPS, Case, Cases, State, dependencies
 from vstent.app.choices import Choices
 from vstent.errors import InputError, ReadError
-from vstent.io.files import suffix
 
 if TYPE_CHECKING:  # imported when a folder is read, as in `vstent.app.choices`
     from vstent.study.settings import Settings
@@ -87,12 +86,6 @@ def _paths(folder: Path, source: str, settings: "Settings") -> dict[str, Path]:
 
     flows = {name: key for name, key in study_keys(source, settings).items() if name.startswith("flow ")}
     return {name.removeprefix("flow "): Store(folder / CACHE).path(name, key) for name, key in flows.items()}
-
-
-def stem(path: Path) -> str:
-    """Return the name of a case from its file or folder: the name without the suffix."""
-    ending = suffix(path)
-    return path.name[: -len(ending)] if ending and path.is_file() else path.name
 
 
 def reopened(cases: Cases, folder: Path) -> Case:

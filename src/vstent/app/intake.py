@@ -9,7 +9,6 @@ import gzip
 import shutil
 import zipfile
 import zlib
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
@@ -57,13 +56,7 @@ def checked_name(name: str) -> str:
 
 
 def take(partial: Path, name: str, case_folder: Path) -> None:
-    """Move a complete upload into the case folder; `partial` is removed.
-
-    Parameters
-    ----------
-    partial : the uploaded file.
-    name : its name on the user's machine.
-    case_folder : the case folder.
+    """Move a complete upload, with its name on the user's machine, into the case folder; `partial` is removed.
 
     Raises
     ------
@@ -78,8 +71,7 @@ def take(partial: Path, name: str, case_folder: Path) -> None:
         elif zipfile.is_zipfile(partial):
             _take_archive(partial, folder)
         else:
-            _refuse_bomb(partial, name)
-            shutil.move(partial, folder / checked_name(name))
+            _take_file(partial, name, folder)
     finally:
         partial.unlink(missing_ok=True)
 
@@ -140,44 +132,33 @@ def _take_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, partial: Path,
             for block in iter(lambda: packed.read(_BLOCK), b""):
                 left -= len(block)
                 if left < 0:  # the sizes that an archive states may be wrong
-                    raise ReadError(
-                        f"The archive unpacks to more than {UNPACKED_LIMIT >> 30} GB, which is too much. Drop "
-                        "a smaller one."
-                    )
+                    raise ReadError(_unpacks_to_too_much("The archive"))
                 out.write(block)
         name = entry.filename.replace("\\", "/").rpartition("/")[2]
         if is_dicom(partial):
             _take_slice(partial, folder)
         elif suffix(Path(name)) in (*SURFACE_SUFFIXES, *IMAGE_SUFFIXES):
-            _refuse_bomb(partial, name)
-            shutil.move(partial, folder / checked_name(name))
+            _take_file(partial, name, folder)
     finally:
         partial.unlink(missing_ok=True)
     return left
 
 
-def _refuse_bomb(path: Path, name: str) -> None:
-    """Raise ReadError for a compressed file that unpacks to more than the limit."""
-    if suffix(Path(name)).endswith(".gz") and _unpacked_size(_blocks(path)) > UNPACKED_LIMIT:
-        raise ReadError(
-            f"{name} unpacks to more than {UNPACKED_LIMIT >> 30} GB, which is too much. Drop a smaller one."
-        )
-
-
-def _blocks(path: Path) -> Iterable[bytes]:
-    """Yield the unpacked content of a gzip file in blocks."""
-    try:
-        with gzip.open(path) as stream:
-            yield from iter(lambda: stream.read(_BLOCK), b"")
-    except (OSError, EOFError, zlib.error):
-        raise ReadError("The compressed file is damaged. Copy it again from its source.") from None
-
-
-def _unpacked_size(blocks: Iterable[bytes]) -> int:
-    """Return the total size of blocks; counting stops above the limit."""
-    total = 0
-    for block in blocks:
-        total += len(block)
+def _take_file(path: Path, name: str, folder: Path) -> None:
+    """Move a file into the case, unless it is compressed and unpacks to more than the limit."""
+    if suffix(Path(name)).endswith(".gz"):
+        total = 0
+        try:
+            with gzip.open(path) as stream:
+                while total <= UNPACKED_LIMIT and (block := stream.read(_BLOCK)):
+                    total += len(block)
+        except (OSError, EOFError, zlib.error):
+            raise ReadError("The compressed file is damaged. Copy it again from its source.") from None
         if total > UNPACKED_LIMIT:
-            break
-    return total
+            raise ReadError(_unpacks_to_too_much(name))
+    shutil.move(path, folder / checked_name(name))
+
+
+def _unpacks_to_too_much(name: str) -> str:
+    """Return the message for a file that unpacks to more than the limit."""
+    return f"{name} unpacks to more than {UNPACKED_LIMIT >> 30} GB, which is too much. Drop a smaller one."

@@ -55,13 +55,7 @@ RANKING: Final = "ranking.json"
 
 
 class Job:
-    """A process that works on a case.
-
-    Parameters
-    ----------
-    case : the case.
-    kind : a key of `KINDS`.
-    """
+    """A process that works on a case: a job of a kind of `KINDS`."""
 
     def __init__(self, case: Case, kind: str) -> None:
         self.case, self.kind = case, kind
@@ -104,12 +98,8 @@ class Job:
 
     def told(self) -> dict[str, Any]:
         """Return the progress as clients read it."""
-        return {
-            "kind": self.kind,
-            "seconds": time.time() - self.began,
-            "finished": self.finished,
-            "residuals": list(self.residuals),
-        } | self.now
+        seconds, residuals = time.time() - self.began, list(self.residuals)
+        return {"kind": self.kind, "seconds": seconds, "finished": self.finished, "residuals": residuals} | self.now
 
     def stop(self) -> None:
         """Stop at once; finished results are kept."""
@@ -160,7 +150,14 @@ class Job:
                 f"The computation ended unexpectedly (its last words: {LAST_WORDS}). Finished results are "
                 "kept; start it again."
             )
-        self._close(failure)
+        steps, keys, state = KINDS[self.kind], dependencies(self._given), self.case.state
+        failed = {step: why for step, why in state.failed.items() if step not in steps}
+        if failure:
+            step = self.step or steps[0]
+            failed |= {step: failure}
+            self.case.update(failed=failed, failed_with=state.failed_with | {step: keys[steps[-1]]}, job="")
+        else:
+            self.case.update(failed=failed, done=state.done | {step: keys[step] for step in steps}, job="")
 
     def _take_anatomy(self, key: str) -> None:
         """Store the key of the anatomy that the job found, and mark its steps as finished."""
@@ -170,7 +167,7 @@ class Job:
         self.case.update(anatomy=key, done=state.done | {step: keys[step] for step in steps}, failed=failed)
 
     def _take(self, now: dict[str, Any]) -> None:
-        """Record the progress of a stage (`vstent.study.progress.Progress`) and notify the clients."""
+        """Record the progress of a stage, mark the steps before the current one as finished, and notify the clients."""
         if now["stage"] != self.now["stage"]:
             self.residuals.clear()
         self.now = now
@@ -178,27 +175,11 @@ class Job:
             self.residuals.append((now["fraction"], now["residual"]))
         if now["fraction"] >= 1.0:
             self.finished.append({"stage": now["stage"], "detail": now["detail"]})
-        self._pass()
-        self.case.tell()
-
-    def _pass(self) -> None:
-        """Mark the steps before the current one as finished."""
         steps, keys, done = KINDS[self.kind], dependencies(self._given), self.case.state.done
         passed = steps[: steps.index(self.step)] if self.step in steps else ()
         if any(done.get(step) != keys[step] for step in passed):
             self.case.update(done=done | {step: keys[step] for step in passed})
-
-    def _close(self, failure: str) -> None:
-        """Store the outcome of the job."""
-        state = self.case.state
-        failed = {step: why for step, why in state.failed.items() if step not in KINDS[self.kind]}
-        done, failed_with, keys = dict(state.done), dict(state.failed_with), dependencies(self._given)
-        if failure:
-            step = self.step or KINDS[self.kind][0]
-            failed[step], failed_with[step] = failure, keys[KINDS[self.kind][-1]]
-        else:
-            done |= {step: keys[step] for step in KINDS[self.kind]}
-        self.case.update(done=done, failed=failed, failed_with=failed_with, job="")
+        self.case.tell()
 
 
 class Jobs:

@@ -28,15 +28,6 @@ def pulled(anatomy: Anatomy, curve_mm: Floats, handle: int, to_mm: Floats) -> Fl
     """Return a neck with one handle moved to a point of the wall; the points near it move too.
 
     Moved points are projected on the wall in proportion to their movement. All other points stay exactly unchanged.
-
-    Parameters
-    ----------
-    anatomy : the anatomy with the wall.
-    curve_mm : (n, 3) points of the neck.
-    handle : number of the handle.
-    to_mm : (3,) new position of the handle.
-
-    Returns (n, 3) points of the new neck.
     """
     at = round(handle * len(curve_mm) / NECK_HANDLES)
     away = (np.arange(len(curve_mm)) - at + len(curve_mm) / 2) % len(curve_mm) - len(curve_mm) / 2

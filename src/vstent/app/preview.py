@@ -1,6 +1,5 @@
 """Answer the page immediately, from the results that a case has so far."""
 
-import threading
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -18,9 +17,11 @@ from vstent.angiography.view import angles_of
 from vstent.angiography.working_projection import working_projection
 from vstent.app import necks, sheets
 from vstent.app.cases import Case
+from vstent.app.choices import Point
 from vstent.app.cuts import cut
 from vstent.app.films import films_message, kept_curves
 from vstent.app.finished import kept_flows, kept_histories
+from vstent.app.scans import LOCK
 from vstent.deployment.contour import planes
 from vstent.deployment.deploy import propose_landing
 from vstent.deployment.measure import measure
@@ -63,8 +64,6 @@ Colour = Literal["wall_gap", "coverage", "diameter"]
 """Quantity that colors the wires."""
 Found = TypeVar("Found")
 
-LOCK: Final = threading.RLock()
-"""Lock for one computation at a time, because parallel compiled loops must not run concurrently."""
 CACHED: Final = 40
 """Number of results cached per case."""
 SECTION_REACH_MM: Final = 9.0
@@ -288,15 +287,13 @@ class Preview:
             drawn=necks.told(necks.curve_of(anatomy)),
         )
 
-    def neck_message(self, curve_mm: Floats, handle: int | None, to_mm: Floats | None) -> bytes:
-        """Return a neck with its area, optionally with one handle moved to a point of the wall.
-
-        Shapes: `curve_mm` (n, 3), `to_mm` (3,).
-        """
+    def neck_message(self, curve_mm: Sequence[Point], handle: int | None = None, to_mm: Point | None = None) -> bytes:
+        """Return a neck with its area, optionally with one handle moved to a point of the wall."""
         with LOCK:
+            curve = np.array(curve_mm, dtype=np.float64)
             if handle is not None and to_mm is not None:
-                curve_mm = necks.pulled(self.anatomy, curve_mm, handle, to_mm)
-            return message([necks.layer_of(curve_mm)], neck=necks.told(curve_mm))
+                curve = necks.pulled(self.anatomy, curve, handle, np.array(to_mm, dtype=np.float64))
+            return message([necks.layer_of(curve)], neck=necks.told(curve))
 
     def anatomy_sheet(self) -> list[dict[str, Any]]:
         """Return the metrics of the anatomy."""

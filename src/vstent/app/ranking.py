@@ -7,7 +7,6 @@ from vstent.app.cases import Case
 from vstent.app.jobs import RANKING
 from vstent.devices.catalogue import find_design
 from vstent.flow.settings import FlowSettings
-from vstent.geometry.vessel import Anatomy
 from vstent.io.writers import write_json
 from vstent.plan.rank import Ranking, rank
 from vstent.plan.rank_flow import rank_flows
@@ -64,28 +63,19 @@ def rank_sizes(case: Case, progress: OnProgress) -> None:
     n_sizes = sum(len(design.sizes) for design in designs)
     jobs = min(os.cpu_count() or 1, MOST_PROCESSES, 1 + n_sizes // WORTH_A_PROCESS)
     found = rank(anatomy, designs, jobs=jobs, progress=told)
-    key = keys[ANATOMY]
+    key, n_flows = keys[ANATOMY], case.state.choices.ranking_flows
     _write(case, key, found)
     progress(Progress("rank", 1.0, f"{len(found.suitable)} of {len(found.candidates)} sizes are suitable."))
-    if case.state.choices.ranking_flows:
-        _write(case, key, _with_flows(case, anatomy, key, found, progress))
+    if n_flows:
+        progress(Progress("rank_flow", 0.0))
+        flow = settings.flow or FlowSettings()
+
+        def told_flow(n_done: float, n_all: int, name: str) -> None:
+            progress(Progress("rank_flow", min(n_done / n_all, 0.99), f"{n_done} of {n_all}: {name}"))
+
+        stored = FlowStore(case.folder, key, flow)
+        _write(case, key, rank_flows(anatomy, found, flow, n_flows, stored=stored, progress=told_flow))
         progress(Progress("rank_flow", 1.0))
-
-
-def _with_flows(case: Case, anatomy: Anatomy, key: Key, found: Ranking, progress: OnProgress) -> Ranking:
-    """Return the ranking with the flows of its best sizes."""
-    settings = case.state.settings().flow or FlowSettings()
-    progress(Progress("rank_flow", 0.0))
-    return rank_flows(
-        anatomy,
-        found,
-        settings,
-        case.state.choices.ranking_flows or 0,
-        stored=FlowStore(case.folder, key, settings),
-        progress=lambda done, n_all, name: progress(
-            Progress("rank_flow", min(done / n_all, 0.99), f"{done} of {n_all}: {name}")
-        ),
-    )
 
 
 def _write(case: Case, anatomy: Key, found: Ranking) -> None:

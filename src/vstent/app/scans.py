@@ -1,5 +1,6 @@
 """Slices of a scan, as stored or along the axes of the patient, and its surface at a threshold, for the page."""
 
+import threading
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -52,6 +53,10 @@ class Grid:
     def to_index(self, points_mm: Floats) -> Floats:
         """Return the fractional voxel indices (n, 3) of positions (n, 3) in LPS mm."""
         return (np.asarray(points_mm, dtype=np.float64) - self.affine_mm[:3, 3]) / self.spacing_mm
+
+
+LOCK: Final = threading.RLock()
+"""Lock for one computation at a time, because parallel compiled loops must not run concurrently."""
 
 
 class Scan:
@@ -176,15 +181,16 @@ class Scan:
         """Return the surface at a threshold, coarse enough to follow a slider, as a message for the page."""
         stride = max(1, int(np.ceil((self.part.voxels.size / COARSE) ** (1 / 3))))
         field = self.part.voxels[::stride, ::stride, ::stride].astype(np.float32)
-        index, faces = isosurface(field, threshold)
         layers, views = [], []
-        if len(faces):
-            label = topology.face_components(faces)
-            count = np.bincount(label)
-            index, faces = triangles.compact(index, faces[count[label] >= SPECK * count.max()])
-            surface = thin_surface(Surface(self.part.to_mm(stride * index), faces), LIVE_FACES)[0]
-            layers = [MeshLayer("live", "", (0.80, 0.62, 0.55), surface)]
-            views = [view_of("whole", FRONTAL, surface.vertices_mm)]
+        with LOCK:
+            index, faces = isosurface(field, threshold)
+            if len(faces):
+                label = topology.face_components(faces)
+                count = np.bincount(label)
+                index, faces = triangles.compact(index, faces[count[label] >= SPECK * count.max()])
+                surface = thin_surface(Surface(self.part.to_mm(stride * index), faces), LIVE_FACES)[0]
+                layers = [MeshLayer("live", "", (0.80, 0.62, 0.55), surface)]
+                views = [view_of("whole", FRONTAL, surface.vertices_mm)]
         return message(layers, views=views, threshold=threshold)
 
 

@@ -51,13 +51,9 @@ class TooLarge(HTTPException):
 
 
 class Guard:
-    """Accepts requests only from the page itself with the token, and sets the headers of every response.
+    """Accepts requests only from the page itself, at accepted host names with port, with the secret token.
 
-    Parameters
-    ----------
-    app : the application.
-    token : secret token.
-    hosts : accepted host names with port.
+    It sets the headers of every response.
     """
 
     def __init__(self, app: ASGIApp, *, token: str, hosts: Iterable[str]) -> None:
@@ -74,11 +70,11 @@ class Guard:
             return
         headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
         refusal = self._refusal(scope, headers)
-        limit = UPLOAD_LIMIT if _is_upload(scope) else BODY_LIMIT
-        if refusal is None and _length(headers) > limit:
+        is_upload = scope["method"] == "PUT" and scope["path"].endswith("/input")
+        limit, length = UPLOAD_LIMIT if is_upload else BODY_LIMIT, headers.get("content-length", "")
+        if refusal is None and length.isdigit() and int(length) > limit:
             refusal = PlainTextResponse(f"More than {limit >> 20} MB, which is too much.", 413)
-        sender = _with_headers(send)
-        await (refusal or self.app)(scope, _counted(receive, limit), sender)
+        await (refusal or self.app)(scope, _counted(receive, limit), _with_headers(send))
 
     def _refusal(self, scope: Scope, headers: dict[str, str]) -> Response | None:
         """Return the response to a request that is not allowed; None where it is allowed."""
@@ -116,17 +112,6 @@ def _token(headers: dict[str, str], cookie: str) -> str:
     except CookieError:
         return ""
     return found.value if found else ""
-
-
-def _is_upload(scope: Scope) -> bool:
-    """Return whether a request uploads a file."""
-    return scope["method"] == "PUT" and scope["path"].endswith("/input")
-
-
-def _length(headers: dict[str, str]) -> int:
-    """Return the stated length of a request in bytes; 0 where it is not stated."""
-    text = headers.get("content-length", "0")
-    return int(text) if text.isdigit() else 0
 
 
 def _counted(receive: Receive, limit: int) -> Receive:

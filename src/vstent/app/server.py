@@ -304,7 +304,7 @@ def _add_input(api: APIRouter, work: Workspace, of_case: Any) -> None:
 
     @api.get("/api/cases/{case_id}/image/surface", summary="The surface at a threshold (binary)")
     def surface(threshold: Finite, case: Case = of_case) -> Response:
-        return Binary(work.surface(case, threshold))
+        return Binary(work.scan(case).surface(threshold))
 
 
 def _add_jobs(api: APIRouter, work: Workspace, of_case: Any) -> None:
@@ -352,7 +352,7 @@ def _add_scenes(api: APIRouter, work: Workspace, of_case: Any) -> None:
 
     @api.post("/api/cases/{case_id}/neck", summary="The neck with a handle moved, and its area (binary)")
     def neck(wanted: NeckWanted, case: Case = of_case) -> Response:
-        return Binary(work.neck(case, *wanted.model_dump().values()))
+        return Binary(work.preview(case).neck_message(**wanted.model_dump()))
 
     @api.post("/api/cases/{case_id}/sketch", summary="The expected position of an implant (binary)")
     def sketch(wanted: SketchWanted, case: Case = of_case) -> Response:

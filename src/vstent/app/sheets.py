@@ -50,13 +50,7 @@ def device(title: str, measures: dict[str, Any]) -> Sheet:
 
 
 def flow(metrics: dict[str, Any], titles: dict[str, str]) -> list[Sheet]:
-    """Return the table of the flow: without a device, and with each device and its relative change.
-
-    Parameters
-    ----------
-    metrics : metrics of the case.
-    titles : titles of the treatments by name, in order.
-    """
+    """Return the table of the flow without a device, and with each device in the order of `titles`, with its change."""
     changes = compare(metrics, unusable(metrics))
     rows = []
     for change in changes:
@@ -74,13 +68,7 @@ def flow(metrics: dict[str, Any], titles: dict[str, str]) -> list[Sheet]:
 
 
 def uncertainty(metrics: dict[str, Any], titles: dict[str, str]) -> list[dict[str, Any]]:
-    """Return the uncertainty intervals of every treatment with an uncertainty study.
-
-    Parameters
-    ----------
-    metrics : metrics of the case.
-    titles : titles of the treatments by name, in order.
-    """
+    """Return the uncertainty intervals of every treatment that has some, in the order of their titles by name."""
     ordered = {"treatments": {name: metrics["treatments"][name] for name in titles}}
     return [
         {"title": varied.title, "words": varied.words, "rows": [row._asdict() for row in varied.rows]}

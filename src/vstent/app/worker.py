@@ -96,13 +96,7 @@ JOBS: Final[dict[str, Callable[[Case], None]]] = {
 
 
 def main(kind: str, folder: Path) -> int:
-    """Run a job; return the exit code.
-
-    Parameters
-    ----------
-    kind : a key of `JOBS`.
-    folder : the case folder.
-    """
+    """Run a job of a kind of `JOBS` on a case folder; return the exit code."""
     given = State.model_validate_json(sys.stdin.readline())
     threading.Thread(target=end_with_the_server, daemon=True).start()
     try:

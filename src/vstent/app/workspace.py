@@ -3,19 +3,18 @@
 import json
 import tempfile
 import threading
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 from vstent.app import intake
 from vstent.app.cases import STATE, STEPS, Case, Cases, dependencies, failures, statuses
-from vstent.app.choices import Point, pulse_of
-from vstent.app.finished import REPORT, RUN, kept_flows, kept_histories, lost_steps, reopened, stem
+from vstent.app.choices import pulse_of
+from vstent.app.finished import REPORT, RUN, kept_flows, kept_histories, lost_steps, reopened
 from vstent.app.jobs import KINDS, RANKING, Jobs
 from vstent.devices.treatment import BARE, Treatment
 from vstent.errors import InputError, ReadError
-from vstent.io.files import atomic, existing
+from vstent.io.files import atomic, existing, suffix
 
 PICTURE: Final = ".picture.png"
 """File of a case folder with its picture in the list of cases."""
@@ -53,7 +52,8 @@ class Workspace:
         elif (path / RUN).is_file():
             self.opened = reopened(self.cases, path).id
         else:
-            case = self.cases.of_input(path) or self.cases.create(stem(path))
+            ending = suffix(path) if path.is_file() else ""
+            case = self.cases.of_input(path) or self.cases.create(path.name[: len(path.name) - len(ending)])
             self.opened = case.id
             if not case.state.source:
                 self._to_begin = (case, path)
@@ -264,7 +264,7 @@ class Workspace:
                 self._scans[case.id] = (grid, crop), found
             return found
 
-    def outlines(self, case: Case, treatment: str | None, axis: int, index: int, *, is_upright: bool = False) -> bytes:
+    def outlines(self, case: Case, treatment: str | None, axis: int, index: int, *, is_upright: bool) -> bytes:
         """Return the outlines on a slice as a message for the page."""
         from vstent.app.outlines import outlines
 
@@ -291,21 +291,6 @@ class Workspace:
         surface, _ = thin_surface(read_surface(case.input, units=choices.units, frame=choices.frame)[0], INPUT_FACES)
         layer = MeshLayer("input", "", WALL_COLOUR, surface)
         return message([layer], views=[view_of("whole", FRONTAL, surface.vertices_mm)])
-
-    def surface(self, case: Case, threshold: float) -> bytes:
-        """Return the surface of the scan at a threshold, as a message for the page."""
-        from vstent.app.preview import LOCK
-
-        scan = self.scan(case)
-        with LOCK:
-            return bytes(scan.surface(threshold))
-
-    def neck(self, case: Case, curve_mm: Sequence[Point], handle: int | None, to_mm: Point | None) -> bytes:
-        """Return a neck through points in LPS mm, with a handle of it moved to a point, as a message for the page."""
-        import numpy as np
-
-        target_mm = None if to_mm is None else np.array(to_mm, dtype=np.float64)
-        return bytes(self.preview(case).neck_message(np.array(curve_mm, dtype=np.float64), handle, target_mm))
 
     def numbers(self, case: Case) -> dict[str, Any]:
         """Return all results so far: anatomy, flow without and with devices, and uncertainty."""
@@ -441,7 +426,7 @@ def _is_surface(case: Case) -> bool:
 
 def _wants_grid(case: Case) -> bool:
     """Return whether number and spacing of the voxels must be given before the scan can be read."""
-    from vstent.io.files import RAW_SUFFIXES, suffix
+    from vstent.io.files import RAW_SUFFIXES
 
     choices = case.state.choices
     return suffix(case.input) in RAW_SUFFIXES and (choices.shape is None or choices.spacing_mm is None)
