@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
-from vstent.io.states import State, program_states, state_of
+from vstent.io.files import State, program_states, state_of
 from vstent.study.folder import CACHE, LOCK
 from vstent.study.store import UNREADABLE, Key, Store, digest
 

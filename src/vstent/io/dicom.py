@@ -192,11 +192,6 @@ class _Series(NamedTuple):
     """Reason why it is no volume; empty where it may be one."""
 
     @property
-    def header(self) -> Any:
-        """Header of the first file."""
-        return self.files[0][1]
-
-    @property
     def n_slices(self) -> int:
         """Number of slices."""
         return sum(_n_frames(dataset) for _, dataset in self.files)
@@ -204,27 +199,26 @@ class _Series(NamedTuple):
     @property
     def rank(self) -> tuple[bool, bool, bool, bool, int]:
         """Suitability; the largest is read."""
-        is_original = _text(getattr(self.header, "ImageType", None)).upper().startswith(("ORIGINAL", "NONE"))
-        is_plain = not _is_reformat(self.header) and not self.is_thick
+        header = self.files[0][1]
+        is_original = _text(getattr(header, "ImageType", None)).upper().startswith(("ORIGINAL", "NONE"))
+        is_thick = False  # much thicker slices than their distance are those of a sliding projection
+        with suppress(*damage()):
+            across, down = np.reshape(np.array(header.ImageOrientationPatient, dtype=np.float64), (2, 3))
+            places = np.array([dataset.ImagePositionPatient for _, dataset in self.files], dtype=np.float64)
+            steps = np.diff(np.sort(places @ np.cross(across, down)))
+            is_thick = float(header.SliceThickness) > MOST_OVERLAP * float(np.median(steps))
+        is_plain = not _is_reformat(header) and not is_thick
         n_voxels = sum(_n_voxels(dataset) for _, dataset in self.files)
         return not self.flaw, self.n_slices >= FEWEST_SLICES, is_plain, is_original, n_voxels
 
-    @property
-    def is_thick(self) -> bool:
-        """Whether slices are much thicker than their distance, as those of a sliding projection."""
-        with suppress(*damage()):
-            across, down = np.reshape(np.array(self.header.ImageOrientationPatient, dtype=np.float64), (2, 3))
-            places = [np.array(one.ImagePositionPatient, dtype=np.float64) for _, one in self.files]
-            steps = np.diff(np.sort(np.stack(places) @ np.cross(across, down)))
-            return float(self.header.SliceThickness) > MOST_OVERLAP * float(np.median(steps))
-        return False
-
     def __str__(self) -> str:
         """Return number, description, type and number of slices."""
-        number, title = (getattr(self.header, name, None) for name in ("SeriesNumber", "SeriesDescription"))
-        kind = _text(getattr(self.header, "ImageType", None)).replace("/", "\\")
+        names = ("SeriesNumber", "SeriesDescription", "ImageType")
+        number, title, kind = (getattr(self.files[0][1], name, None) for name in names)
+        kind = _text(kind).replace("/", "\\")
         of = f"{self.n_slices} {'images: ' + self.flaw if self.flaw else 'slices'}"
-        return f"{'without number' if number is None else number}{f' {title!r}' if title else ''} ({kind}, {of})"
+        label = f"{'without number' if number is None else number}{f' {title!r}' if title else ''}"
+        return f"{label} ({kind}, {of})"
 
 
 FEWEST_SLICES: Final = 8
@@ -285,11 +279,11 @@ def _choose(path: Path) -> tuple[list[tuple[Path, Any]], tuple[str, ...]]:
         )
         n_held = sum(file.stat().st_size for file, _ in chosen.files)
         refuse_bomb(f"{path} states {counted(chosen.n_slices, 'slice')}", n_bytes, n_held)
+        if len(every) < 2 or not path.is_dir():
+            return chosen.files, ()
         others = "; ".join(str(series) for series in every if series is not chosen)
-        note = (
-            f"{len(every)} DICOM series found. Series {chosen} is used; others: {others}. To use another one, give one "
-        )
-        return chosen.files, (f"{note}of its files.",) if others and path.is_dir() else ()
+        note = f"{len(every)} DICOM series found. Series {chosen} is used; others: {others}."
+        return chosen.files, (f"{note} To use another one, give one of its files.",)
     except damage():  # pydicom raises faults of a header when its values are used
         raise ReadError(f"{path} holds a DICOM file with a damaged header. Copy it again, or remove it.") from None
 
@@ -490,9 +484,7 @@ def _acquisitions(planes: list[_Slice]) -> tuple[str, list[tuple[str, list[_Slic
 
     It is the first attribute that divides slices of the same position so that every group has each position once.
     """
-    if len({plane.place for plane in planes}) == len(planes):
-        return "", []
-    for key in ACQUISITION_KEYS:
+    for key in ACQUISITION_KEYS if len({plane.place for plane in planes}) < len(planes) else ():
         groups: dict[str, list[_Slice]] = {}
         for plane in planes:
             groups.setdefault(_text(getattr(plane.dataset, key, None)), []).append(plane)
@@ -567,7 +559,12 @@ def _arrange(slices: list[_Slice]) -> tuple[list[_Slice], Floats, tuple[str, ...
     try:
         _refuse_uneven(slices, height[order], position - position[0] - np.arange(len(slices))[:, None] * step, step_mm)
     except ReadError:
-        if not _fits_rounded(position, rounding_mm):
+        design = np.stack([np.ones(len(slices)), np.arange(len(slices))], axis=1)
+        line = np.linalg.lstsq(design, position)[0]
+        fitted_mm = float(np.linalg.norm(line[1]))
+        # The deviation of a missing slice is at least a quarter of the slice distance.
+        most_mm = min(ROUNDED * rounding_mm + SPACING_TOLERANCE * fitted_mm, 0.24 * fitted_mm)
+        if not np.abs(position - design @ line).max() <= most_mm:
             raise
         rounded = f"The slice positions are rounded to {rounding_mm:g} mm"
         notes = (*notes, f"{rounded}: an even distance of {step_mm:.4g} mm is used.")
@@ -579,17 +576,6 @@ def _arrange(slices: list[_Slice]) -> tuple[list[_Slice], Floats, tuple[str, ...
     return slices, affine, notes
 
 
-def _fits_rounded(position_mm: Floats, rounding_mm: float) -> bool:
-    """Return whether positions (n, 3) are evenly spaced on a line but for the rounding of their digits."""
-    number = np.arange(len(position_mm), dtype=np.float64)
-    design = np.stack([np.ones_like(number), number], axis=1)
-    line = np.linalg.lstsq(design, position_mm)[0]
-    step_mm = float(np.linalg.norm(line[1]))
-    # The deviation of a missing slice is at least a quarter of the slice distance.
-    most_mm = min(ROUNDED * rounding_mm + SPACING_TOLERANCE * step_mm, 0.24 * step_mm)
-    return bool(np.abs(position_mm - design @ line).max() <= most_mm)
-
-
 def _common_directions(slices: list[_Slice]) -> Floats:
     """Return the directions (2, 3) of rows and columns; ReadError is raised where a slice differs from the others."""
     tilt, pixel = (np.array([getattr(p, name).ravel() for p in slices]) for name in ("orientation", "pixel_mm"))
@@ -597,9 +583,10 @@ def _common_directions(slices: list[_Slice]) -> Floats:
         raise ReadError(
             "A slice has a position, orientation or pixel spacing that is not a number. Export the series again."
         )
+    sizes = np.array([plane.size for plane in slices])
     usual = Counter(plane.size for plane in slices).most_common(1)[0][0]
     for what, is_odd in (
-        ("size", np.array([plane.size != usual for plane in slices])),
+        ("size", (sizes != usual).any(axis=1)),
         ("pixel spacing", (np.abs(pixel - np.median(pixel, axis=0)) > SAME * np.median(pixel, axis=0)).any(axis=1)),
         ("orientation", (np.abs(tilt - np.median(tilt, axis=0)) > SAME).any(axis=1)),
     ):
@@ -711,6 +698,5 @@ def _decoded_by_gdcm(plane: _Slice) -> NDArray[Any]:
             f"The pixels of slice {plane.name} are damaged or in a format that is not supported. "
             "Copy it again, or export the series uncompressed."
         ) from None
-    array = SimpleITK.GetArrayFromImage(scan)
-    stored = (array - plane.intercept) / plane.slope  # GDCM returns rescaled values
+    stored = (SimpleITK.GetArrayFromImage(scan) - plane.intercept) / plane.slope  # GDCM returns rescaled values
     return stored if plane.frame is not None else stored[0]

@@ -8,7 +8,7 @@ import shutil
 import tempfile
 import threading
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedIOBase
 from pathlib import Path, PureWindowsPath
@@ -157,3 +157,29 @@ def silenced() -> Iterator[None]:
             os.dup2(saved, 2)
             os.close(saved)
             os.close(sink)
+
+
+# -- sizes and dates of files, by which unchanged files are recognized without reading them ----------------------------
+
+State = list[int] | None
+"""Size in bytes and date of the last change in ns; None: there is no such file."""
+
+
+def state_of(file: Path) -> State:
+    """Return the state of a file."""
+    with suppress(OSError):
+        state = file.stat()
+        return [state.st_size, state.st_mtime_ns]
+    return None
+
+
+def states_of(folder: Path, names: Iterable[str]) -> dict[str, State]:
+    """Return the states of files of a folder by name."""
+    return {name: state_of(folder / name) for name in names}
+
+
+def program_states() -> dict[str, State]:
+    """Return the states of the program's own files, by their path in the package."""
+    root = Path(__file__).parents[1]
+    files = sorted(root.rglob("*.py")) + sorted(root.rglob("*.toml"))
+    return states_of(root, (str(file.relative_to(root)) for file in files))

@@ -62,9 +62,7 @@ def read_image(
 def files_of(path: Path) -> list[Path]:
     """Return all files that are read when a folder, or one file of a scan or surface, is given.
 
-    These are the DICOM files of a folder, without those of a folder of results; or the file itself, separate voxel
-    files that its header names, and the other files of a DICOM series. Missing files are left out; `read_image` reports
-    them.
+    These include separate voxel files and the other files of a DICOM series. Missing ones are left out.
     """
     if path.is_dir() or dicom.is_directory(path):
         return dicom.candidates(path)

@@ -69,7 +69,5 @@ def _reason(error: Exception) -> str:
     """Return the last plain sentence of an ITK exception in parentheses, or nothing where it gives no reason."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     last = lines[-1].split("): ", 1)[-1].rstrip(".") if lines else ""
-    says_little = (
-        not last or "sitk::ERROR" in last or last.startswith("Reason:") or " " not in last.strip("0123456789 ")
-    )
-    return "" if says_little else f" ({last[:150]})"
+    is_plain = "sitk::ERROR" not in last and not last.startswith("Reason:") and " " in last.strip("0123456789 ")
+    return f" ({last[:150]})" if is_plain else ""

@@ -1,7 +1,6 @@
 """Read scans in this process: DICOM, NIfTI, NRRD, MetaImage, VTK images and raw voxels, as an `Image` in LPS mm."""
 
 import math
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -12,7 +11,16 @@ from numpy.typing import DTypeLike, NDArray
 from vstent.errors import ReadError, UnitError
 from vstent.geometry.image import Image
 from vstent.io import dicom
-from vstent.io.files import IMAGE_SUFFIXES, NIFTI_SUFFIXES, RAW_SUFFIXES, existing, is_vtk_image, suffix, unpacked
+from vstent.io.files import (
+    DAMAGE,
+    IMAGE_SUFFIXES,
+    NIFTI_SUFFIXES,
+    RAW_SUFFIXES,
+    existing,
+    is_vtk_image,
+    suffix,
+    unpacked,
+)
 from vstent.io.itk import read_itk
 from vstent.io.limits import MOST_BYTES
 from vstent.io.nifti import read_nifti
@@ -38,7 +46,7 @@ def read_scan(
     if is_series:
         image = dicom.read_dicom(path, has_spacing=has_spacing, acquisition=acquisition)
     elif kind in RAW_SUFFIXES:
-        return _read_raw(path, spacing_mm, shape, dtype)
+        image = _read_raw(path, shape, dtype, has_spacing=has_spacing)
     elif kind in NIFTI_SUFFIXES:
         image = read_nifti(path, has_spacing=has_spacing)
     elif kind == ".vti" or is_vtk_image(path):
@@ -50,36 +58,22 @@ def read_scan(
             f"{path.name} is not a scan that vstent reads. Give a DICOM folder or one of {', '.join(IMAGE_SUFFIXES)}."
         )
     if spacing_mm is not None:
-        image = _respaced(image, _three(spacing_mm, "spacing"))
-    image = _plausible(image, path)
+        given = np.atleast_1d(np.asarray(spacing_mm, dtype=np.float64))
+        if len(given) not in (1, 3) or not (np.isfinite(given) & (given > 0)).all():
+            raise UnitError(
+                f"The spacing must be one or three positive numbers, not {', '.join(f'{v:g}' for v in given)}; "
+                "give --spacing in mm."
+            )
+        affine = np.array(image.affine_mm)
+        affine[:3, :3] *= given / image.spacing_mm
+        note = () if kind in RAW_SUFFIXES else ("The voxel spacing is the one given, not the one in the header.",)
+        image = Image(image.voxels, affine, image.modality, (*image.notes, *note), image.is_oriented)
+    _refuse_implausible(image, path)
     return image if is_series else rectangular(image)  # the affine of a tilted DICOM series is exact
 
 
-def _three(values: Sequence[float], what: str) -> NDArray[np.float64]:
-    """Return one or three positive numbers as three; UnitError is raised for others."""
-    given = np.atleast_1d(np.asarray(values, dtype=np.float64))
-    if len(given) not in (1, 3) or not (np.isfinite(given) & (given > 0)).all():
-        raise UnitError(
-            f"The {what} must be one or three positive numbers, not {', '.join(f'{v:g}' for v in given)}; "
-            "give --spacing in mm."
-        )
-    return np.broadcast_to(given, (3,)).astype(np.float64)
-
-
-def _respaced(image: Image, spacing_mm: NDArray[np.float64]) -> Image:
-    """Return an image with another voxel spacing."""
-    affine = np.array(image.affine_mm)
-    affine[:3, :3] *= spacing_mm / image.spacing_mm
-    return Image(
-        image.voxels,
-        affine,
-        image.modality,
-        (*image.notes, "The voxel spacing is the one given, not the one in the header."),
-    )
-
-
-def _plausible(image: Image, path: Path) -> Image:
-    """Return an image; an error is raised where its spacing, size, values or byte order are implausible."""
+def _refuse_implausible(image: Image, path: Path) -> None:
+    """Raise an error where the spacing, size, values or byte order of an image are implausible."""
     low, high = VOXEL_MM
     if not ((image.spacing_mm >= low) & (image.spacing_mm <= high)).all():
         size = " x ".join(f"{v:.4g}" for v in image.spacing_mm)
@@ -92,37 +86,11 @@ def _plausible(image: Image, path: Path) -> Image:
         raise ReadError(f"{path.name} contains voxels that are not numbers (NaN). Export it again as integers.")
     if image.voxels.dtype.kind in "iu" and image.voxels.dtype.itemsize == 2:
         middle = np.ravel(image.voxels[:, :, image.voxels.shape[2] // 2], order="F")
-        swapped = _roughness(middle.byteswap())
-        if swapped < min(SMOOTH, _roughness(middle) / SWAPPED_ROUGHNESS):
+        if _roughness(middle.byteswap()) < min(SMOOTH, _roughness(middle) / SWAPPED_ROUGHNESS):
             raise ReadError(f"{path.name}: the voxels have the wrong byte order. Export it again.")
-    return image
 
 
 # -- raw voxels --------------------------------------------------------------------------------------------------------
-
-
-def _read_raw(
-    path: Path, spacing_mm: Sequence[float] | None, shape: Sequence[int] | None, dtype: DTypeLike | None
-) -> Image:
-    """Return the image in a file of raw voxels."""
-    if spacing_mm is None:
-        raise UnitError(f"{path.name} has no header that states the voxel spacing; give --spacing in mm.")
-    if shape is None or len(shape) != 3 or min(shape) < 1:
-        raise ReadError(f"{path.name} has no header that states the number of voxels; give --shape NI,NJ,NK.")
-    spacing = _three(spacing_mm, "spacing")
-    n = math.prod(shape)
-    data = _bytes(path, n * LARGEST_VOXEL)
-    kind, note = (np.dtype(dtype), ()) if dtype is not None else _guessed_dtype(data, n, path)
-    if len(data) != n * kind.itemsize:
-        raise ReadError(
-            f"{path.name} holds {len(data)} bytes, but {' x '.join(map(str, shape))} voxels of {kind.name} are "
-            f"{n * kind.itemsize}; check --shape."
-        )
-    voxels = np.frombuffer(data, kind).reshape(tuple(shape)[::-1]).transpose()
-    affine = np.diag([*spacing, 1.0])
-    image = Image(voxels.astype(kind.newbyteorder("="), copy=False), affine, notes=note, is_oriented=False)
-    return _plausible(image, path)
-
 
 SWAPPED_ROUGHNESS: Final = 2.0
 """Ratio of the roughness as stored to the roughness with swapped bytes above which the byte order is wrong."""
@@ -130,32 +98,44 @@ SMOOTH: Final = 0.1
 """Largest roughness of a scan in the right byte order, including noise."""
 LARGEST_VOXEL: Final = 8
 """Bytes of the largest voxel type."""
+RAW_TYPES: Final = {1: ("u1",), 2: ("<i2", ">i2"), 4: ("<f4", ">f4", "<i4", ">i4")}
+"""Usual types of raw voxels, by their number of bytes."""
 
 
-def _bytes(path: Path, most: int) -> bytes:
-    """Return the unpacked content of a file, but at most `most` + 1 bytes."""
+def _read_raw(path: Path, shape: Sequence[int] | None, dtype: DTypeLike | None, *, has_spacing: bool) -> Image:
+    """Return the image in a file of raw voxels, with a spacing of 1 mm.
+
+    Without a type, it is the one that matches the size of the file, in the byte order with smoother rows.
+    """
+    if not has_spacing:
+        raise UnitError(f"{path.name} has no header that states the voxel spacing; give --spacing in mm.")
+    if shape is None or len(shape) != 3 or min(shape) < 1:
+        raise ReadError(f"{path.name} has no header that states the number of voxels; give --shape NI,NJ,NK.")
+    n = math.prod(shape)
     try:
         with unpacked(path) if suffix(path) == ".raw.gz" else path.open("rb") as file:
-            return file.read(min(most, MOST_BYTES) + 1)
-    except (OSError, EOFError, zlib.error):
+            data = file.read(min(n * LARGEST_VOXEL, MOST_BYTES) + 1)
+    except DAMAGE:
         raise ReadError(f"{path.name} is damaged: it cannot be unpacked. Copy it again.") from None
-
-
-def _guessed_dtype(data: bytes, n: int, path: Path) -> tuple[np.dtype[Any], tuple[str, ...]]:
-    """Return the voxel type that matches the file size, in the byte order with smoother rows, and a note on it."""
-    candidates = {1: ("u1",), 2: ("<i2", ">i2"), 4: ("<f4", ">f4", "<i4", ">i4")}.get(len(data) // n if n else 0, ())
-    if not candidates or len(data) % n:
+    notes: tuple[str, ...] = ()
+    if dtype is None:
+        candidates = RAW_TYPES.get(len(data) // n, ()) if len(data) % n == 0 else ()
+        if not candidates:
+            raise ReadError(
+                f"{path.name} holds {len(data)} bytes, which is not 1, 2 or 4 for each of {n} voxels; check --shape."
+            )
+        best = min(candidates, key=lambda kind: _roughness(np.frombuffer(data, kind)))
+        order = {"<": "little-endian", ">": "big-endian"}.get(best[0], "one byte each")
+        notes = (f"Raw voxels are read as {np.dtype(best).newbyteorder('=').name} ({order}).",)
+        dtype = best
+    kind = np.dtype(dtype)
+    if len(data) != n * kind.itemsize:
         raise ReadError(
-            f"{path.name} holds {len(data)} bytes, which is not 1, 2 or 4 for each of {n} voxels; check --shape."
+            f"{path.name} holds {len(data)} bytes, but {' x '.join(map(str, shape))} voxels of {kind.name} are "
+            f"{n * kind.itemsize}; check --shape."
         )
-    best = min(candidates, key=lambda kind: _roughness(np.frombuffer(data, kind)))
-    kind = np.dtype(best)
-    return kind, (f"Raw voxels are read as {kind.newbyteorder('=').name} ({_order(best)}).",)
-
-
-def _order(kind: str) -> str:
-    """Return the byte order of a voxel type as text."""
-    return {"<": "little-endian", ">": "big-endian"}.get(kind[0], "one byte each")
+    voxels = np.frombuffer(data, kind).reshape(tuple(shape)[::-1]).transpose()
+    return Image(voxels.astype(kind.newbyteorder("="), copy=False), np.eye(4), notes=notes, is_oriented=False)
 
 
 def _roughness(values: NDArray[Any]) -> float:

@@ -13,8 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
-from vstent.io.files import atomic
-from vstent.io.states import state_of
+from vstent.io.files import atomic, state_of
 from vstent.kernels.cache import kept_in
 from vstent.study.store import UNREADABLE, digest
 

@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 from vstent.errors import VstentError
-from vstent.io.files import atomic
-from vstent.io.states import states_of
+from vstent.io.files import atomic, states_of
 from vstent.study.progress import OnProgress, Progress
 
 if TYPE_CHECKING:
