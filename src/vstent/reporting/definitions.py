@@ -228,7 +228,23 @@ DEFINITIONS: Final[dict[str, Definition]] = {
     # the flow
     "inlet_flow_mL_s": Definition("Inlet flow", "Flow of blood through the inlet."),
     "outlet_flow_mL_s": Definition("Outlet flow", "Flow of blood through the outlet."),
-    "neck_inflow_mL_s": Definition("Neck inflow", "Integral over the neck of the velocity component into the sac."),
+    "neck_inflow_mL_s": Definition(
+        "Neck inflow",
+        "Integral over the section by the neck plane of the velocity component into the sac; over the opening of the "
+        "sac where there is no neck plane.",
+    ),
+    "neck_inflow_in_sac_mL_s": Definition(
+        "Neck inflow, 0.5 mm into the sac",
+        "The same integral over the section of the sac 0.5 mm beyond the neck plane.",
+    ),
+    "neck_inflow_in_artery_mL_s": Definition(
+        "Neck inflow, 0.5 mm into the artery",
+        "The same integral over the outline of the neck, moved 0.5 mm from the neck plane into the artery.",
+    ),
+    "opening_inflow_mL_s": Definition(
+        "Inflow through the sac's opening",
+        "The same integral over the surface that closes the sac, which may be curved and extend along the artery.",
+    ),
     "turnover_time_s": Definition("Turnover time", "Sac volume divided by neck inflow."),
     "mean_sac_velocity_m_s": Definition(
         "Mean sac velocity",
@@ -373,6 +389,9 @@ OF_PULSE: Final = (
 
 WANTED: Final = {
     "neck_inflow_mL_s": -1,
+    "neck_inflow_in_sac_mL_s": -1,
+    "neck_inflow_in_artery_mL_s": -1,
+    "opening_inflow_mL_s": -1,
     "mean_sac_velocity_m_s": -1,
     "sac_kinetic_energy_J": -1,
     "turnover_time_s": 1,
@@ -381,6 +400,8 @@ WANTED: Final = {
 no direction is agreed on."""
 HEADLINES: Final = (
     "neck_inflow_mL_s",
+    "neck_inflow_in_sac_mL_s",
+    "neck_inflow_in_artery_mL_s",
     "mean_sac_velocity_m_s",
     "turnover_time_s",
     "mean_sac_wss_Pa",

@@ -43,6 +43,7 @@ from vstent.study.stages import (
     find_anatomy,
     find_vessel,
     measure_study,
+    neck_notes,
     refine,
     vary_all,
 )
@@ -130,7 +131,7 @@ def run(
     writers.write_json(out / RUN, told, is_exact=True)
     of_flows = (f"Flow, {name}: {field.advice}" for name, field in fields.items())
     of_failures = (f"{name}: {sentence}" for name, sentence in failures.items())
-    notes = (*of_failures, *anatomy.vessel.notes, *anatomy.notes, *of_flows)
+    notes = (*of_failures, *anatomy.vessel.notes, *anatomy.notes, *of_flows, *neck_notes(metrics))
     return CaseResult(
         **vars(found),
         name=out.resolve().name,
