@@ -26,6 +26,8 @@ from vstent.study.progress import Progress
 
 ROWS: Final = (
     ("Neck inflow", "neck_inflow_mL_s"),
+    ("- 0.5 mm into the sac", "neck_inflow_in_sac_mL_s"),
+    ("- 0.5 mm into the artery", "neck_inflow_in_artery_mL_s"),
     ("Mean sac velocity", "mean_sac_velocity_m_s"),
     ("Sac wall shear stress, mean", "mean_sac_wss_Pa"),
     ("Turnover time", "turnover_time_s"),

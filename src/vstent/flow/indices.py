@@ -1,5 +1,6 @@
 """Hemodynamic indices of a flow, and their change with a device."""
 
+from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -32,7 +33,12 @@ QUANTITIES: Final = (
 """Indices compared between grids, as far as the vessel has them."""
 
 
-def indices(field: FlowField, sac: Surface | None = None, ostium: Surface | None = None) -> dict[str, float]:
+def indices(
+    field: FlowField,
+    sac: Surface | None = None,
+    ostium: Surface | None = None,
+    beside: Mapping[str, Surface] | None = None,
+) -> dict[str, float]:
     """Compute all hemodynamic indices of a flow, with the unit in each key.
 
     Of the vessel: ``inlet_flow_mL_s``, ``outlet_K_flow_mL_s``, ``inlet_pressure_Pa``, ``pressure_drop_Pa`` (inlet to
@@ -41,7 +47,7 @@ def indices(field: FlowField, sac: Surface | None = None, ostium: Surface | None
 
     - ``neck_inflow_mL_s`` = integral over the ostium of max(u.n, 0) and ``neck_outflow_mL_s`` of max(-u.n, 0), with
       tricubic interpolation of the velocity; ``inflow_area_fraction`` = part of the ostium where u.n > 0;
-      ``turnover_time_s`` = sac volume / neck inflow;
+      ``turnover_time_s`` = sac volume / neck inflow; the inflow through every surface of `beside`, as ``NAME_mL_s``;
     - ``mean_sac_velocity_m_s``, ``max_sac_velocity_m_s``, ``mean_sac_pressure_Pa`` over the sac's cells;
       ``sac_kinetic_energy_J`` = integral of rho u^2 / 2; ``fast_sac_volume_mm3`` where u > 0.08 m/s;
     - ``mean_sac_wss_Pa``, ``max_sac_wss_Pa`` over the sac's wall; ``parent_wss_Pa`` over the other wall within 10 mm of
@@ -64,6 +70,9 @@ def indices(field: FlowField, sac: Surface | None = None, ostium: Surface | None
         Closed surface of the sac.
     ostium : Surface, optional
         Opening of the sac, with normals into the sac.
+    beside : mapping, optional
+        Further surfaces by name (`vstent.flow.ostium.surfaces_beside`). Where the neck inflow cannot be computed from
+        the field, the inflow through them is scaled by the same factor as that through the ostium.
     """
     openings = roles(len(field.inlets_mL_s), len(field.outlets_mL_s))
     through_mL_s = np.concatenate([field.inlets_mL_s, field.outlets_mL_s]).tolist()
@@ -74,7 +83,7 @@ def indices(field: FlowField, sac: Surface | None = None, ostium: Surface | None
     result["mean_wss_Pa"] = float(np.average(field.shear_Pa, weights=vertex_areas_mm2(field.wall)))
     if sac is None or ostium is None:
         return result
-    of_moments = [_of_ostium(now, ostium) | _of_sac(now, sac) for now in field.moments()]
+    of_moments = [_of_ostium(now, ostium, beside or {}) | _of_sac(now, sac) for now in field.moments()]
     for key in of_moments[0]:
         values = [one[key] for one in of_moments]
         result[key] = max(values) if key.startswith("max_") else float(np.mean(values))
@@ -126,15 +135,19 @@ def compare(anatomy: Anatomy, before: FlowField, after: FlowField) -> dict[str, 
     return {key: Change(first[key], second[key], change.get(f"{key}_ratio", np.nan)) for key in first if key in second}
 
 
-def _of_ostium(field: FlowField, ostium: Surface) -> dict[str, float]:
-    """Return the indices of the flow through the ostium."""
-    points_mm, area_mm2 = sampling.surface_samples(ostium, field.finest.cell_size_mm)
-    through_mL_s = sampling.through_surface_mL_s(field, points_mm, area_mm2)
-    sizes_mm2 = np.linalg.norm(area_mm2, axis=1)
-    inflow_mL_s = field.neck_inflow_mL_s
-    if inflow_mL_s is None:
-        inflow_mL_s = sampling.inflow_mL_s(through_mL_s)
+def _of_ostium(field: FlowField, ostium: Surface, beside: Mapping[str, Surface]) -> dict[str, float]:
+    """Return the indices of the flow through the ostium, and the inflow through further surfaces."""
+
+    def through(surface: Surface) -> tuple[Floats, Floats]:
+        points_mm, area_mm2 = sampling.surface_samples(surface, field.finest.cell_size_mm)
+        return sampling.through_surface_mL_s(field, points_mm, area_mm2), np.linalg.norm(area_mm2, axis=1)
+
+    through_mL_s, sizes_mm2 = through(ostium)
+    sampled_mL_s = sampling.inflow_mL_s(through_mL_s)
+    inflow_mL_s = sampled_mL_s if field.neck_inflow_mL_s is None else field.neck_inflow_mL_s
+    factor = inflow_mL_s / max(sampled_mL_s, 1e-12)
     return {
+        **{f"{name}_mL_s": factor * sampling.inflow_mL_s(through(one)[0]) for name, one in beside.items()},
         "neck_inflow_mL_s": inflow_mL_s,
         "neck_outflow_mL_s": inflow_mL_s - float(through_mL_s.sum()),
         "inflow_area_fraction": float(sizes_mm2[through_mL_s > 0].sum() / sizes_mm2.sum()),

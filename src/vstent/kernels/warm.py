@@ -2,7 +2,20 @@
 
 import numpy as np
 
-from vstent.kernels import coverage, curves, digits, footprints, medial, net, raster, sampling, tree, triangles, voxels
+from vstent.kernels import (
+    coverage,
+    curves,
+    digits,
+    footprints,
+    medial,
+    net,
+    raster,
+    sampling,
+    sections,
+    tree,
+    triangles,
+    voxels,
+)
 
 
 def warm() -> None:
@@ -29,6 +42,7 @@ def _search() -> None:
     tiny = tree.build(vertices, faces)
     tree.closest_points(tiny, vertices)
     tree.segments_cross(tiny, vertices, 2 * vertices)
+    sections.beyond(sections.sheet(vertices, faces, vertices), 0, vertices, vertices)
     tree.inscribed_radii(tree.curved(tiny, triangles.smooth_normals(vertices, faces)[faces]), vertices)
 
 

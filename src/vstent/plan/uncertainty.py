@@ -21,7 +21,7 @@ from vstent.devices.ranges import altered, values_at
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import DeviceError, InputError, LandingError
 from vstent.flow.indices import indices, ratios
-from vstent.flow.ostium import ostium
+from vstent.flow.ostium import ostium, surfaces_beside
 from vstent.flow.problem import flow_case
 from vstent.flow.settings import FlowSettings
 from vstent.flow.simulation import Checkpoint, simulate_case
@@ -42,7 +42,13 @@ RESULTS: Final = (
     "neck_pore_density_per_mm2",
 )
 """Measures of the deployment for which intervals are computed."""
-FLOW_RESULTS: Final = ("neck_inflow_mL_s_ratio", "mean_sac_velocity_m_s_ratio", "mean_sac_wss_Pa_ratio")
+FLOW_RESULTS: Final = (
+    "neck_inflow_mL_s_ratio",
+    "neck_inflow_in_sac_mL_s_ratio",
+    "neck_inflow_in_artery_mL_s_ratio",
+    "mean_sac_velocity_m_s_ratio",
+    "mean_sac_wss_Pa_ratio",
+)
 """Ratios of the flow with to the flow without the device for which intervals are computed."""
 WIDEST_FRACTION: Final = 0.1
 """Fraction of the free diameter below which the range of the device's diameter must be."""
@@ -64,6 +70,9 @@ class Uncertainty:
     """(n, k) results; NaN if the device did not fit or the flow was not computed."""
     numbers: tuple[str, ...] = ()
     """(d) numbers of the device that were varied."""
+    neck_mm2: tuple[float, float, float] | None = None
+    """Area of the section by the neck plane, and the smallest and largest one by planes that separate the sac nearly as
+    well; None without a neck plane."""
 
     def __post_init__(self) -> None:
         freeze(self, "ranges", np.float64, (len(self.causes),))
@@ -105,16 +114,19 @@ class Uncertainty:
     def metrics(self) -> dict[str, Any]:
         """Return all results as numbers whose names end in their unit."""
         told = [name for name in self.names if len(self._found(name)[1]) > 1]
+        intervals = {name: dict(zip(("mean", "low", "high"), self.interval(name), strict=True)) for name in told}
+        shares = {name: {f"{cause}_fraction": share for cause, share in self.shares(name).items()} for name in told}
+        if self.neck_mm2 is not None:
+            intervals["neck_plane_area_mm2"] = dict(zip(("mean", "low", "high"), self.neck_mm2, strict=True))
+            shares["neck_plane_area_mm2"] = {"neck_fraction": 1.0}
         ranges = dict(zip(("threshold_mm", "landing_mm", "device_mm", "inflow_fraction"), self.ranges, strict=False))
         return {
             "samples_count": len(self.points),
             "failed_count": self.n_failed,
             "ranges": {name: float(value) for name, value in ranges.items()},
             "numbers": ", ".join(self.numbers),
-            "intervals": {name: dict(zip(("mean", "low", "high"), self.interval(name), strict=True)) for name in told},
-            "shares": {
-                name: {f"{cause}_fraction": share for cause, share in self.shares(name).items()} for name in told
-            },
+            "intervals": intervals,
+            "shares": shares,
         }
 
 
@@ -173,7 +185,9 @@ def vary(
     values = np.array([[row.get(name, np.nan) for name in names] for row in rows], dtype=np.float64)
     half = [0.5 * (one.high - one.low) for one in numbers]
     told = tuple(one.name for one in numbers)
-    return Uncertainty(np.append(spread, half), points, names, values.reshape(len(points), len(names)), told)
+    plane = anatomy.aneurysms[0].plane if anatomy.aneurysms else None
+    neck_mm2 = None if plane is None else (plane.area_mm2, *plane.area_band_mm2)
+    return Uncertainty(np.append(spread, half), points, names, values.reshape(len(points), len(names)), told, neck_mm2)
 
 
 def made_wider(design: Design, size: Size, by_mm: float) -> Size:
@@ -226,7 +240,7 @@ def _sample(
 def _flow_ratios(anatomy: Anatomy, stent: Stent, flow: FlowSettings) -> dict[str, float]:
     """Return the ratios of the flow with to the flow without the device."""
     sac = anatomy.aneurysms[0]
-    shapes = sac.sac, ostium(sac, anatomy.vessel.lumen)
+    shapes = sac.sac, ostium(sac, anatomy.vessel.lumen), surfaces_beside(sac, anatomy.vessel.lumen)
     bare = simulate_case(flow_case(anatomy, (), flow))
     after = simulate_case(flow_case(anatomy, (stent,), flow), start=bare)
     found = ratios(indices(bare, *shapes), indices(after, *shapes))

@@ -73,10 +73,17 @@ def _line(line: Centerline, half_mm: float) -> Centerline:
 
 
 def _sac(aneurysm: Aneurysm, wall: _Shift, tube: _Shift) -> Aneurysm:
-    """Return an aneurysm moved with the wall (sac) and the landing surface (neck)."""
+    """Return an aneurysm moved with the wall (sac, section by the neck plane) and the landing surface (neck)."""
+    plane = aneurysm.plane
+    if plane is not None:
+        moved = replace(plane, rim_mm=wall(plane.rim_mm))
+        factor = moved.area_mm2 / plane.area_mm2
+        low_mm2, high_mm2 = plane.area_band_mm2
+        plane = replace(moved, area_band_mm2=(factor * low_mm2, factor * high_mm2))
     return replace(
         aneurysm,
         sac=Surface(wall(aneurysm.sac.vertices_mm), aneurysm.sac.faces),
         neck=Surface(tube(aneurysm.neck.vertices_mm), aneurysm.neck.faces),
         neck_mm=tube(aneurysm.neck_mm),
+        plane=plane,
     )

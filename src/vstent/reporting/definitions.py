@@ -45,6 +45,9 @@ OF_PULSE: Final = (
 
 WANTED: Final = {
     "neck_inflow_mL_s": -1,
+    "neck_inflow_in_sac_mL_s": -1,
+    "neck_inflow_in_artery_mL_s": -1,
+    "opening_inflow_mL_s": -1,
     "mean_sac_velocity_m_s": -1,
     "sac_kinetic_energy_J": -1,
     "turnover_time_s": 1,
@@ -53,6 +56,8 @@ WANTED: Final = {
 no direction is agreed on."""
 HEADLINES: Final = (
     "neck_inflow_mL_s",
+    "neck_inflow_in_sac_mL_s",
+    "neck_inflow_in_artery_mL_s",
     "mean_sac_velocity_m_s",
     "turnover_time_s",
     "mean_sac_wss_Pa",

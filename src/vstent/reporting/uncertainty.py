@@ -25,6 +25,7 @@ CAUSES: Final = {
     "landing": "landing",
     "device": "manufacturing tolerance",
     "inflow": "inflow",
+    "neck": "choice of the neck plane",
     "rest": "interplay and chance",
 }
 """Display names of the causes of uncertainty."""

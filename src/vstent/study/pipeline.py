@@ -143,7 +143,7 @@ def run(
     writers.write_json(out / RUN, record, is_exact=True)
     of_flows = (f"Flow, {name}: {field.advice}" for name, field in fields.items())
     of_failures = (f"{name}: {sentence}" for name, sentence in failures.items())
-    notes = (*of_failures, *anatomy.vessel.notes, *anatomy.notes, *of_flows)
+    notes = (*of_failures, *anatomy.vessel.notes, *anatomy.notes, *of_flows, *stages.neck_notes(metrics))
     return CaseResult(
         **vars(computed),
         name=out.resolve().name,

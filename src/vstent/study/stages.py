@@ -6,6 +6,7 @@ from dataclasses import asdict, replace
 from functools import partial
 from math import isfinite
 from pathlib import Path
+from re import fullmatch
 from typing import Any, Final
 
 import numpy as np
@@ -29,7 +30,7 @@ from vstent.flow.case import FlowField
 from vstent.flow.engines import Progress as FlowProgress
 from vstent.flow.grade import computation_of, grade
 from vstent.flow.indices import indices, ratios
-from vstent.flow.ostium import ostium
+from vstent.flow.ostium import ostium, surfaces_beside
 from vstent.flow.problem import flow_case, vessel_case
 from vstent.flow.settings import FlowSettings
 from vstent.flow.simulation import OnProgress, foretell_cost, simulate_case
@@ -359,7 +360,8 @@ def measure_study(
 ) -> dict[str, Any]:
     """Return all metrics of a study: of vessel, implants and flows, with bands, uncertainties and failures."""
     sac = anatomy.aneurysms[0] if anatomy.aneurysms else None
-    shapes = (sac.sac, ostium(sac, anatomy.vessel.lumen)) if sac else ()
+    lumen = anatomy.vessel.lumen
+    shapes = (sac.sac, ostium(sac, lumen), surfaces_beside(sac, lumen)) if sac and fields else ()
     treatments: dict[str, dict[str, Any]] = {BARE: {}} if fields else {}
     for name, deployed in implants.items():
         treatments[name] = {"implants": {id_: measure(anatomy, one) for id_, one in deployed.items()}}
@@ -384,6 +386,21 @@ def measure_study(
         treatments[name]["uncertainty"] = spread
     metrics = {"vessel": morphology(anatomy), "treatments": treatments}
     return metrics | ({"failures": dict(failures)} if failures else {})
+
+
+def neck_notes(metrics: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return a note on every flow whose neck inflow exceeds the flow through all inlets."""
+    notes = []
+    for name, treatment in metrics["treatments"].items():
+        flow = treatment.get("flow", {})
+        entering_mL_s = sum(value for key, value in flow.items() if fullmatch(r"inlet(_\d+)?_flow_mL_s", key))
+        if flow.get("neck_inflow_mL_s", 0.0) > entering_mL_s:
+            notes.append(
+                f"Flow, {name}: the neck inflow, {flow['neck_inflow_mL_s']:.2f} mL/s, exceeds the "
+                f"{entering_mL_s:.2f} mL/s that enter the vessel: blood crosses the neck to and fro. Compare it with "
+                "the inflow 0.5 mm into the sac."
+            )
+    return tuple(notes)
 
 
 def bands_of(anatomy: Anatomy, deployment: Deployment, measures: Measures, implant: Implant) -> dict[str, Any]:
