@@ -12,8 +12,8 @@ import numpy as np
 
 from vstent.deployment.active_contour import ActiveContour
 from vstent.deployment.deploy import deploy
-from vstent.deployment.evenly_spaced import Zhong2016
 from vstent.deployment.measure import measure
+from vstent.deployment.method import Zhong2016
 from vstent.devices import catalogue
 from vstent.devices.stent import Landing
 from vstent.errors import VstentError

@@ -16,7 +16,9 @@ from vstent.anatomy.repair import repair
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
-from vstent.deployment.braid import ConstantWire, Profile, bend, march
+from vstent.deployment.active_contour import ActiveContour
+from vstent.deployment.braid import ConstantWire, Profile, march
+from vstent.deployment.contour import planes
 from vstent.deployment.deploy import METHODS, deploy, propose_landing
 from vstent.deployment.measure import measure
 from vstent.deployment.method import Placement, run
@@ -94,7 +96,8 @@ def timed(work: Callable[[], Any], repeats: int = 5) -> tuple[Any, float]:
 def integral_mm(stent: Stent, anatomy: Anatomy) -> float:
     """Length that constant wires give at the diameters that the device has, where the artery bends as it does."""
     middle_mm = float(stent.row_abscissa_mm[(len(stent.row_abscissa_mm) - 1) // 2])
-    profile = Profile(stent.row_abscissa_mm, stent.row_diameter_mm, bend(anatomy))
+    across = planes(anatomy.parent.axis)
+    profile = Profile(stent.row_abscissa_mm, stent.row_diameter_mm, (across.abscissa_mm, across.curvature_per_mm))
     return float(np.ptp(march(stent.design, stent.size, Landing(middle_mm), profile)))
 
 
@@ -145,7 +148,7 @@ def speed(anatomy: Anatomy) -> list[str]:
     design = catalogue.find_design("silk")
     size = catalogue.find_size(design, diameter_mm=4, length_mm=20)
     landing = propose_landing(design, anatomy, size)
-    method = ConstantWire().beside(1e-3 * design.wall_offset_um)
+    method = ConstantWire(ActiveContour(dd_mm=1e-3 * design.wall_offset_um))
 
     def contour() -> Any:
         return run(method, Placement(design, size, landing, anatomy, landing_wall(anatomy)[0]))

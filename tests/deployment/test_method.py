@@ -15,8 +15,8 @@ from vstent.deployment.active_contour import ActiveContour
 from vstent.deployment.braid import ConstantWire
 from vstent.deployment.contour import perimeters
 from vstent.deployment.deploy import deploy
-from vstent.deployment.evenly_spaced import Zhong2016
 from vstent.deployment.measure import measure, wire_stretches
+from vstent.deployment.method import Zhong2016
 from vstent.deployment.wall import inner_face
 from vstent.devices import catalogue, formulas
 from vstent.devices import design as device

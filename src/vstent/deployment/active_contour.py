@@ -89,32 +89,18 @@ class State:
     """Factored matrix I + tau K."""
 
     def about(self, centers_mm: Floats, rows: Ints) -> "State":
-        """Return the contour with other fiducial points.
+        """Return the contour with other fiducial points (rows, columns, 3) inside the lumen.
 
-        The clearance of a new point is that of the old one less the distance between them.
-
-        Parameters
-        ----------
-        centers_mm : (rows, columns, 3), mm; new fiducial points inside the lumen.
-        rows : (rows, columns); row of this contour whose fiducial point is near each new one.
-
-        Returns the contour with the new fiducial points.
+        Near each of them is that of one of this contour's `rows` (rows, columns). Its clearance, less the distance
+        between the two, is that of the new one.
         """
         off_mm = curves.lengths(centers_mm - self.centers_mm[rows, 0])
         return replace(self, centers_mm=centers_mm, clearance_mm=np.maximum(self.clearance_mm[rows, 0] - off_mm, 0.0))
 
     def near(self, points_mm: Floats, centers_mm: Floats, rows: Ints, columns: Ints) -> "State":
-        """Return points between the nodes as a contour of one column.
+        """Return points (n, 3) between the nodes, with fiducial points (n, 3), as a contour of n rows and one column.
 
-        Each point takes the terminated state and the wall contact of one node near it.
-
-        Parameters
-        ----------
-        points_mm : (n, 3), mm; the points.
-        centers_mm : (n, 3), mm; their fiducial points.
-        rows, columns : (n,); the node near each point.
-
-        Returns contour of n rows and one column.
+        Each takes the terminated state and the wall contact of the node near it, at `rows` and `columns` (n,).
         """
         number = rows * self.nodes_mm.shape[1] + columns
         return replace(
@@ -178,16 +164,9 @@ class ActiveContour:
     """Largest number of iterations."""
 
     def init(self, nodes_mm: Floats, centers_mm: Floats, clearance_mm: Floats, wall: AbstractWall) -> State:
-        """Create the state before the first iteration.
+        """Create the state before the first iteration: nodes (rows, columns, 3) about centers (rows, 3) of the rows.
 
-        Parameters
-        ----------
-        nodes_mm : (rows, columns, 3), mm; nodes of the closed contour.
-        centers_mm : (rows, 3), mm; centers of the rows, inside the lumen.
-        clearance_mm : (rows,), mm; distances from the centers to the wall.
-        wall : wall of the artery.
-
-        Returns the contour, with no node terminated.
+        The centers have the clearances (rows,) from the wall.
         """
         shape = nodes_mm.shape
         return State(
@@ -241,26 +220,22 @@ class ActiveContour:
 
         1. Inside and farther than dd from the wall: the node continues. 2. Inside and nearer than dd: the node
         terminates, eq. (6). 3. Outside (the segment from the center of its row crosses the wall): the node terminates,
-        eq. (7).
-
-        Parameters
-        ----------
-        state : State
-            The contour.
-        is_asked : (rows, columns) array of bool
-            Nodes to sort. All others stay the same.
-        wall : AbstractWall
-            Wall of the artery.
-
-        Returns
-        -------
-        State
-            The contour with these nodes sorted and relocated.
+        eq. (7). Nodes that are not in `is_asked` (rows, columns) stay the same.
         """
         asked = is_asked.ravel()
         points_mm = state.nodes_mm.reshape(-1, 3).copy()
         found = wall.contact(points_mm[asked])
-        is_outside = _is_outside(state, asked, found.distance_mm, wall)
+        # No wall lies within the clearance of a center or within the distance of a node. Only the part of the
+        # segment between these two balls is tested, if there is one.
+        centers_mm, clearance_mm = state.centers_mm.reshape(-1, 3)[asked], SAFELY * state.clearance_mm.ravel()[asked]
+        way_mm = points_mm[asked] - centers_mm
+        length_mm = curves.lengths(way_mm)
+        is_open = clearance_mm + SAFELY * found.distance_mm < length_mm
+        along = (way_mm / np.maximum(length_mm, ON_WALL_MM)[:, None])[is_open]
+        starts_mm = centers_mm[is_open] + clearance_mm[is_open, None] * along
+        ends_mm = points_mm[asked][is_open] - SAFELY * found.distance_mm[is_open, None] * along
+        is_outside = np.zeros(len(length_mm), dtype=bool)
+        is_outside[is_open] = wall.crosses(starts_mm, ends_mm)
         is_done = is_outside | (found.distance_mm <= self.dd_mm)
         relocated = self.relocated_mm(points_mm[asked], is_outside, found)
         points_mm[asked] = np.where(is_done[:, None], relocated, points_mm[asked])
@@ -272,10 +247,7 @@ class ActiveContour:
         return replace(state, nodes_mm=nodes_mm, is_terminated=is_terminated, contact=contact)
 
     def relocated_mm(self, points_mm: Floats, is_outside: Bools, contact: Contact) -> Floats:
-        """Return points (n, 3) moved to the distance dd from their closest wall points, into the lumen, eq. (6, 7).
-
-        Shapes: `points_mm` (n, 3), `is_outside` (n,).
-        """
+        """Return points (n, 3) moved to the distance dd from their closest wall points, into the lumen, eq. (6, 7)."""
         away = contact.inward(points_mm)
         side = np.where(is_outside & (contact.distance_mm > ON_WALL_MM), -1.0, 1.0)
         return contact.closest_mm + self.dd_mm * side[:, None] * away
@@ -283,20 +255,3 @@ class ActiveContour:
     def terminate(self, state: State) -> bool:
         """Return whether enough nodes have terminated."""
         return state.terminated_fraction >= self.terminated_goal
-
-
-def _is_outside(state: State, asked: Bools, distance_mm: Floats, wall: AbstractWall) -> Bools:
-    """Return whether the segment from the row center to each of the nodes `asked` crosses the wall."""
-    # No wall lies within the clearance of a center or within the distance of a node. Only the part of the
-    # segment between these two balls is tested, if there is one.
-    centers_mm, points_mm = state.centers_mm.reshape(-1, 3)[asked], state.nodes_mm.reshape(-1, 3)[asked]
-    clearance_mm = SAFELY * state.clearance_mm.ravel()[asked]
-    way_mm = points_mm - centers_mm
-    length_mm = curves.lengths(way_mm)
-    is_open = clearance_mm + SAFELY * distance_mm < length_mm
-    along = (way_mm / np.maximum(length_mm, ON_WALL_MM)[:, None])[is_open]
-    starts_mm = centers_mm[is_open] + clearance_mm[is_open, None] * along
-    ends_mm = points_mm[is_open] - SAFELY * distance_mm[is_open, None] * along
-    is_outside = np.zeros(len(points_mm), dtype=bool)
-    is_outside[is_open] = wall.crosses(starts_mm, ends_mm)
-    return is_outside

@@ -72,12 +72,6 @@ def planes(axis: Centerline) -> Planes:
 
     The plane normals are the tangents of the axis, smoothed along it just enough for neighbouring planes to meet
     outside the wall. In a bend sharper than the artery's radius, true cross-sections would intersect inside the lumen.
-
-    Parameters
-    ----------
-    axis : axis of the parent artery.
-
-    Returns planes along the whole axis. The result is cached.
     """
     n = max(8, round(axis.length_mm / STEP_MM) + 1)
     abscissa_mm = np.linspace(0.0, axis.length_mm, n)
@@ -125,16 +119,10 @@ def circles(radius_mm: Floats, columns: int) -> Floats:
 
 
 def perimeters(nodes: Floats) -> Floats:
-    """Compute the lengths of closed rows as smooth curves.
+    """Compute the lengths (n,) of closed rows of nodes (n, m, d) as smooth curves.
 
     An arc is longer than its chord by 8/3 h^2 / chord, with h its height. Four nodes in a row give h. A factor corrects
     the remaining error of this formula for a circle.
-
-    Parameters
-    ----------
-    nodes : (n, m, d); nodes of n closed rows.
-
-    Returns (n,): lengths, in the unit of the nodes.
     """
     m = nodes.shape[1]
     length = curves.closed_lengths(nodes)
@@ -144,11 +132,9 @@ def perimeters(nodes: Floats) -> Floats:
 
 
 def evenly_spaced(nodes: Floats) -> Floats:
-    """Slide the nodes of every closed row along it until their distances are equal.
+    """Slide the nodes (n, m, d) of every closed row along it until their distances are equal.
 
     Each row is turned as little as possible and keeps its length.
-
-    Shapes: `nodes` (n, m, d).
     """
     n, m = nodes.shape[:2]
     closed = np.concatenate([nodes, nodes[:, :1]], axis=1)

@@ -7,7 +7,6 @@ import numpy as np
 
 from vstent.anatomy.morphology import Measures
 from vstent.deployment.crowns import free_crowns
-from vstent.devices.design import LaserCut
 from vstent.devices.formulas import coverage_fraction, grid, mesh_rows, pore_density_per_mm2
 from vstent.devices.stent import Stent
 from vstent.geometry.surface import Surface
@@ -53,7 +52,6 @@ def pore_areas_mm2(stent: Stent) -> tuple[Floats, Floats, Floats]:
     outer layer do not divide them, and its ends without a mesh have none.
     """
     shape = grid(stent.design, stent.size)
-    lattice_mm = stent.nodes_mm[:: shape.row_split, :: shape.column_split]
     cells = quad_areas_mm2(stent).reshape(
         shape.lattice_rows - 1, shape.row_split, shape.lattice_columns, shape.column_split
     )
@@ -61,23 +59,18 @@ def pore_areas_mm2(stent: Stent) -> tuple[Floats, Floats, Floats]:
     pairs = cell_mm2 + np.roll(cell_mm2, 1, axis=1)
     area_mm2 = 0.5 * (pairs[:-1] + pairs[1:])
     row, column = pore_places(stent)
-    number = np.ones(area_mm2.shape)
-    if isinstance(stent.design, LaserCut):
-        is_free = free_crowns(stent.design, shape)[1:-1]
-        number -= 0.5 * (np.roll(is_free, 1, axis=1).astype(float) + np.roll(is_free, -1, axis=1))
-    return area_mm2[row - 1, column], lattice_mm[row, column], number[row - 1, column]
+    is_free = free_crowns(stent.design, shape)
+    number = 1 - 0.5 * (np.roll(is_free, 1, axis=1).astype(float) + np.roll(is_free, -1, axis=1))
+    middle_mm = stent.nodes_mm[row * shape.row_split, column * shape.column_split]
+    return area_mm2[row - 1, column], middle_mm, number[row, column]
 
 
 def density(anatomy: Anatomy, stent: Stent) -> Measures:
-    """Measure metal coverage and pore density of the whole device and over the neck.
+    """Measure metal coverage and pore density of the whole mesh and over the neck, where the device lies over it.
 
-    Returns coverage (fraction) and pore density (1/mm2), with the closed formulas at the mean diameter. Those of the
-    whole device refer to its mesh. Numbers over the neck are left out where nothing of the device lies over it.
+    The values of the closed formulas are those at the mean diameter.
     """
-    quads_mm = 0.25 * (stent.nodes_mm[1:] + stent.nodes_mm[:-1])
-    quads_mm = (quads_mm + np.roll(quads_mm, -1, axis=1)).reshape(-1, 3)
     covered, quad_mm2 = coverage_fractions(stent), quad_areas_mm2(stent)
-    hidden, area_mm2 = covered.ravel(), quad_mm2.ravel()
     pore_mm2, pores_mm, pores = pore_areas_mm2(stent)
     mesh = slice(*stent.mesh_nodes)
     diameter_mm = float(stent.row_diameter_mm[mesh.start : mesh.stop + 1].mean())
@@ -89,9 +82,11 @@ def density(anatomy: Anatomy, stent: Stent) -> Measures:
     if len(pores_mm):
         found["pore_density_per_mm2"] = float(pores.sum() / pore_mm2.sum())
     if anatomy.aneurysms:
-        on_neck = is_over_neck(anatomy, quads_mm)
+        quads_mm = 0.25 * (stent.nodes_mm[1:] + stent.nodes_mm[:-1])
+        quads_mm = quads_mm + np.roll(quads_mm, -1, axis=1)
+        on_neck = is_over_neck(anatomy, quads_mm.reshape(-1, 3)).reshape(covered.shape)
         if on_neck.any():
-            found["neck_metal_coverage_fraction"] = float(np.average(hidden[on_neck], weights=area_mm2[on_neck]))
+            found["neck_metal_coverage_fraction"] = float(np.average(covered[on_neck], weights=quad_mm2[on_neck]))
         on_neck = is_over_neck(anatomy, pores_mm)
         if on_neck.any():
             found["neck_pore_density_per_mm2"] = float(pores[on_neck].sum() / pore_mm2[on_neck].sum())
@@ -108,14 +103,7 @@ def _neck_on_landing(anatomy: Anatomy) -> Surface:
 
 
 def is_over_neck(anatomy: Anatomy, points_mm: Floats) -> Bools:
-    """Return whether points on the device lie over the neck of the largest aneurysm.
-
-    Parameters
-    ----------
-    points_mm : (n, 3), mm; points on the device.
-
-    Returns (n,): points where the landing surface closes or faces the neck.
-    """
+    """Return whether the landing surface closes or faces the largest neck at points (n, 3) on a device."""
     neck = _neck_on_landing(anatomy)
     at_most_mm = anatomy.parent.landing_surface.closest(points_mm)[1] + NECK_TOLERANCE_MM
     low_mm, high_mm = neck.vertices_mm.min(axis=0), neck.vertices_mm.max(axis=0)

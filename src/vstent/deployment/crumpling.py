@@ -46,9 +46,7 @@ class Cells(NamedTuple):
 
 
 def cells(stent: Stent, axis: Centerline) -> Cells:
-    """Compute how wide the cells of a device are, seen from the axis of the artery.
-
-    Returns width and place of every cell; empty where the device has no whole cell.
+    """Compute how wide the cells of a device are, seen from the axis of the artery; none where no cell is whole.
 
     Notes
     -----
@@ -58,10 +56,7 @@ def cells(stent: Stent, axis: Centerline) -> Cells:
     struts around. Where crowns are free, both halves of a cell have tips of their own at its sides.
     """
     shape = grid(stent.design, stent.size)
-    joints_mm = stent.nodes_mm[:: shape.row_split, :: shape.column_split]
-    lower_mm = upper_mm = joints_mm  # tips of the ring below and of the ring above
-    if stent.crown_shift_mm.size:
-        lower_mm, upper_mm = joints_mm + stent.crown_shift_mm
+    lower_mm, upper_mm = stent.joints_mm
     row, column = pore_places(stent)
     left, right = (column - 1) % shape.lattice_columns, (column + 1) % shape.lattice_columns
     low_mm, high_mm = upper_mm[row - 1, column], lower_mm[row + 1, column]
@@ -70,27 +65,20 @@ def cells(stent: Stent, axis: Centerline) -> Cells:
     up_mm = 0.5 * (left_mm + right_mm) - low_mm, high_mm - 0.5 * (left_above_mm + right_above_mm)
     area2_mm2 = np.cross(right_mm - left_mm, up_mm[0]) + np.cross(right_above_mm - left_above_mm, up_mm[1])
     middle_mm = 0.25 * (low_mm + high_mm + 0.5 * (left_mm + right_mm + left_above_mm + right_above_mm))
-    abscissa_mm, outward, inward = _around(middle_mm, axis, float(stent.row_diameter_mm.mean()))
-    width_mm = np.einsum("kj,kj->k", area2_mm2, outward) / curves.lengths(up_mm[0] + up_mm[1])
-    diameter_mm = stent.row_diameter_mm[:: shape.row_split][row]
-    straight_mm = diameter_mm * np.sin(2 * np.pi / shape.lattice_columns)
-    return Cells(width_mm / straight_mm, abscissa_mm, inward)
-
-
-def _around(points_mm: Floats, axis: Centerline, diameter_mm: float) -> tuple[Floats, Floats, Floats]:
-    """Return arc lengths (k,) in mm of points (k, 3), unit vectors (k, 3) from the axis, and cosines to the inside."""
-    abscissa_mm = axis.nearest_abscissa_mm(points_mm)
-    across = planes(axis)
+    abscissa_mm, across = axis.nearest_abscissa_mm(middle_mm), planes(axis)
     normal = across.at(abscissa_mm)[1][:, 0]
-    from_axis_mm = points_mm - axis.at(abscissa_mm)
-    from_axis_mm = from_axis_mm - np.einsum("kj,kj->k", from_axis_mm, normal)[:, None] * normal
-    outward = from_axis_mm / curves.lengths(from_axis_mm)[:, None]
+    outward = middle_mm - axis.at(abscissa_mm)
+    outward = outward - np.einsum("kj,kj->k", outward, normal)[:, None] * normal
+    outward = outward / curves.lengths(outward)[:, None]
     turning = np.gradient(across.frames[:, 0], across.abscissa_mm, axis=0)
     toward = curves.interpolate(across.abscissa_mm, turning, abscissa_mm)
     curvature_per_mm = curves.lengths(toward)
-    is_bent = curvature_per_mm * diameter_mm > BENT
-    cosine = np.einsum("kj,kj->k", outward, toward) / np.where(is_bent, curvature_per_mm, 1.0)
-    return abscissa_mm, outward, np.where(is_bent, cosine, 0.0)
+    is_bent = curvature_per_mm * float(stent.row_diameter_mm.mean()) > BENT
+    inward = np.einsum("kj,kj->k", outward, toward) / np.where(is_bent, curvature_per_mm, 1.0)
+    width_mm = np.einsum("kj,kj->k", area2_mm2, outward) / curves.lengths(up_mm[0] + up_mm[1])
+    diameter_mm = stent.row_diameter_mm[:: shape.row_split][row]
+    straight_mm = diameter_mm * np.sin(2 * np.pi / shape.lattice_columns)
+    return Cells(width_mm / straight_mm, abscissa_mm, np.where(is_bent, inward, 0.0))
 
 
 class Crumpling(NamedTuple):
@@ -142,7 +130,9 @@ def crumpling_measures(anatomy: Anatomy, stent: Stent) -> Measures:
 
 def place_of_narrowest(anatomy: Anatomy, found: Crumpling) -> str:
     """Say where the narrowest cell lies: its distance from the nearer end of the neck, and the side of the bend."""
-    side = _side(found.inward)
+    side = f", on the {'inner' if found.inward > 0 else 'outer'} side of the bend"
+    if abs(found.inward) < BESIDE:
+        side = ", between the inner and the outer side of the bend" if found.inward else ""
     if not anatomy.aneurysms:
         return f"at {found.abscissa_mm:.1f} mm along the parent artery{side}"
     beyond_mm = {
@@ -151,12 +141,3 @@ def place_of_narrowest(anatomy: Anatomy, found: Crumpling) -> str:
     end = min(beyond_mm, key=lambda name: abs(beyond_mm[name]))
     way = "proximal" if beyond_mm[end] < 0 else "distal"
     return f"{abs(beyond_mm[end]):.1f} mm {way} to the {end} end of the neck{side}"
-
-
-def _side(inward: float) -> str:
-    """Return a clause on the side of the bend for a cosine to its inner side; empty where the artery is straight."""
-    if inward == 0.0:
-        return ""
-    if abs(inward) < BESIDE:
-        return ", between the inner and the outer side of the bend"
-    return f", on the {'inner' if inward > 0 else 'outer'} side of the bend"

@@ -2,14 +2,14 @@
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from vstent.deployment import sizing, wires
 from vstent.deployment.advice import advise
 from vstent.deployment.braid import ConstantWire
-from vstent.deployment.evenly_spaced import Zhong2016
-from vstent.deployment.method import AbstractMethod, Course, Placement, Progress, laid_inside, run
+from vstent.deployment.method import AbstractMethod, Course, Placement, Progress, Zhong2016, laid_inside, run
 from vstent.deployment.wall import landing_wall
 from vstent.devices.catalogue import find_design
 from vstent.devices.design import Design, Size
@@ -81,7 +81,12 @@ def deploy(
     """
     began = time.perf_counter()
     design = find_design(design) if isinstance(design, str) else design
-    chosen = _method(method).beside(design.wall_offset_um * MM_PER_UM)
+    if isinstance(method, str):
+        if method not in METHODS:
+            raise InputError(f"There is no deployment method called {method!r}. Choose one of {', '.join(METHODS)}.")
+        method = METHODS[method]()
+    dd_mm = design.wall_offset_um * MM_PER_UM
+    chosen = replace(method, contour=replace(method.contour, dd_mm=dd_mm))
     size = compacted(design, size or propose_size(design, anatomy), compaction_fraction)
     wall, is_patient = landing_wall(anatomy, inside)
 
@@ -89,12 +94,11 @@ def deploy(
         return run(chosen, Placement(design, size, there, anatomy, wall), progress)
 
     course = laid_inside(opened_at, propose_landing(design, anatomy, size)) if landing is None else opened_at(landing)
-    nodes_mm = course.opened.contour.nodes_mm
-    crowns = course.opened.crowns
+    nodes_mm, crowns = course.opened.contour.nodes_mm, course.opened.crowns
     drawn = wires.draw(design, size, nodes_mm, wall, crowns)
     stent = Stent(design, size, nodes_mm, course.opened.abscissa_mm, *drawn, crowns.shift_mm)
     contact = wall.contact(nodes_mm.reshape(-1, 3))
-    gap_mm = np.maximum(contact.distance_mm - chosen.contour.dd_mm, 0.0).reshape(nodes_mm.shape[:2])
+    gap_mm = np.maximum(contact.distance_mm - dd_mm, 0.0).reshape(nodes_mm.shape[:2])
     return Deployment(
         stent=stent,
         outcome=course.outcome,
@@ -105,12 +109,3 @@ def deploy(
         history_mm=np.array(course.history_mm),
         energy_mm2=np.array(course.energy_mm2),
     )
-
-
-def _method(method: AbstractMethod | str) -> AbstractMethod:
-    """Return the deployment method, looked up by its name where a name is given."""
-    if isinstance(method, AbstractMethod):
-        return method
-    if method not in METHODS:
-        raise InputError(f"There is no deployment method called {method!r}. Choose one of {', '.join(METHODS)}.")
-    return METHODS[method]()

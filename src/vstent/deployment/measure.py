@@ -6,12 +6,11 @@ import numpy as np
 
 from vstent.anatomy.landing_zones import neck_points_mm, neck_span_mm
 from vstent.anatomy.morphology import Measures
-from vstent.deployment.apposition import apposition
-from vstent.deployment.coverage import density
+from vstent.deployment.coverage import density, quad_areas_mm2
 from vstent.deployment.crowns import free_crowns
 from vstent.deployment.crumpling import crumpling_measures
-from vstent.deployment.sizing import oversizing_fraction
-from vstent.devices.design import LaserCut, piece_length_mm
+from vstent.deployment.sizing import APPOSED_GAP_MM, oversizing_fraction
+from vstent.devices.design import piece_length_mm
 from vstent.devices.formulas import grid
 from vstent.devices.stent import Deployment, Stent
 from vstent.geometry.vessel import Anatomy
@@ -41,11 +40,13 @@ def measure(anatomy: Anatomy, deployment: Deployment) -> Measures:
     Fractions over the "neck" concern the part of the contour that closes the largest aneurysm. Coverage and pore
     density are measured on the drawn wires. The values of the closed formulas at the same mean diameter are listed too.
     """
+    stretch = wire_stretches(deployment.stent)
+    p95 = float(np.quantile(np.abs(stretch), 0.95))
     return (
         _position(anatomy, deployment.stent)
         | apposition(anatomy, deployment)
         | density(anatomy, deployment.stent)
-        | _stretch(deployment.stent)
+        | {"mean_wire_stretch_fraction": float(stretch.mean()), "p95_wire_stretch_fraction": p95}
         | crumpling_measures(anatomy, deployment.stent)
         | _free_crowns(anatomy, deployment.stent)
         | _branches(anatomy, deployment.stent)
@@ -86,37 +87,50 @@ def _position(anatomy: Anatomy, stent: Stent) -> Measures:
     return found
 
 
+def apposition(anatomy: Anatomy, deployment: Deployment) -> Measures:
+    """Measure the gaps to the patient's own wall, and how far nodes lie outside the landing surface.
+
+    Only the latter is given where the whole device lies over restored wall.
+    """
+    stent, surface = deployment.stent, anatomy.parent.landing_surface
+    points_mm = stent.nodes_mm.reshape(-1, 3)
+    _, distance_mm, face = surface.closest(points_mm)
+    middle_mm = np.repeat(stent.nodes_mm.mean(axis=1), stent.nodes_mm.shape[1], axis=0)
+    outside: Measures = {
+        "max_outside_mm": float(np.where(surface.crosses(middle_mm, points_mm), distance_mm, 0.0).max())
+    }
+    is_wall = anatomy.parent.is_patient_face[face]
+    if not is_wall.any():
+        return outside
+    quarter_mm2 = 0.25 * quad_areas_mm2(stent)
+    beside_mm2 = np.pad(quarter_mm2 + np.roll(quarter_mm2, 1, axis=1), ((1, 1), (0, 0)))
+    area_mm2 = (beside_mm2[1:] + beside_mm2[:-1]).ravel()[is_wall]  # of the contour that belongs to every node
+    gap_mm = deployment.wall_gap_mm.ravel()[is_wall]
+    return {
+        "apposed_fraction": float((gap_mm < APPOSED_GAP_MM).mean()),
+        "mean_wall_gap_mm": float(gap_mm.mean()),
+        "max_wall_gap_mm": float(gap_mm.max()),
+        "malapposition_volume_mm3": float((gap_mm * area_mm2).sum()),
+    } | outside
+
+
 def wire_stretches(stent: Stent) -> Floats:
     """Return the relative elongation (p,) of every piece of wire or strut between junctions."""
-    shape = grid(stent.design, stent.size)
-    junctions_mm = stent.nodes_mm[:: shape.row_split, :: shape.column_split]
-    row, column = np.meshgrid(np.arange(shape.lattice_rows - 1), np.arange(shape.lattice_columns), indexing="ij")
-    row, column = row[(row + column) % 2 == 0], column[(row + column) % 2 == 0]
-    lower_mm = upper_mm = junctions_mm
-    if stent.crown_shift_mm.size:
-        upper_mm, lower_mm = junctions_mm + stent.crown_shift_mm
-    ends_mm = [upper_mm[row + 1, (column + hand) % shape.lattice_columns] for hand in (1, -1)]
-    length_mm = np.linalg.norm(np.stack(ends_mm) - lower_mm[row, column], axis=2).ravel()
+    below_mm, above_mm = stent.joints_mm
+    rows, columns = below_mm.shape[:2]
+    row, column = np.nonzero(np.add.outer(np.arange(rows - 1), np.arange(columns)) % 2 == 0)
+    ends_mm = [below_mm[row + 1, (column + hand) % columns] for hand in (1, -1)]
+    length_mm = np.linalg.norm(np.stack(ends_mm) - above_mm[row, column], axis=2).ravel()
     return length_mm / piece_length_mm(stent.design, stent.size) - 1
-
-
-def _stretch(stent: Stent) -> Measures:
-    """Return the mean and the 95th percentile of the wire stretch."""
-    stretch = wire_stretches(stent)
-    return {
-        "mean_wire_stretch_fraction": float(stretch.mean()),
-        "p95_wire_stretch_fraction": float(np.quantile(np.abs(stretch), 0.95)),
-    }
 
 
 def _free_crowns(anatomy: Anatomy, stent: Stent) -> Measures:
     """Return the number of free crowns, and how far the farthest ones point out of the artery and into the lumen."""
-    if not stent.crown_shift_mm.size or not isinstance(stent.design, LaserCut):
+    if not stent.crown_shift_mm.size:
         return {}
     shape = grid(stent.design, stent.size)
     is_free = free_crowns(stent.design, shape)
-    nodes_mm = stent.nodes_mm[:: shape.row_split, :: shape.column_split][is_free]
-    tips_mm = (nodes_mm + stent.crown_shift_mm[:, is_free]).reshape(-1, 3)
+    tips_mm = stent.joints_mm[:, is_free].reshape(-1, 3)
     middle_mm = np.tile(stent.nodes_mm.mean(axis=1)[:: shape.row_split][np.nonzero(is_free)[0]], (2, 1))
     distance_mm = anatomy.parent.landing_surface.closest(tips_mm)[1]
     is_outside = anatomy.parent.landing_surface.crosses(middle_mm, tips_mm)

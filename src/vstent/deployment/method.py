@@ -4,7 +4,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Final, Literal, Self, TypeVar, final
+from typing import Final, Literal, TypeVar, final
 
 import numpy as np
 
@@ -64,20 +64,9 @@ class Placement:
         return free_diameters_mm(self.design, self.size)
 
     def start(self, contour: ActiveContour, rows_mm: Floats, widest_mm: Floats | float = np.inf) -> State:
-        """Create the closed contour from circles of the maximum inscribed spheres.
+        """Create the closed contour from circles of the maximum inscribed spheres, at most `widest_mm` (rows,) wide.
 
-        Parameters
-        ----------
-        contour : the active contour with its weights.
-        rows_mm : (rows,), mm; arc lengths of the rows.
-        widest_mm : (rows,) or; largest diameter of every row, in mm.
-
-        Returns the contour before the first iteration.
-
-        Raises
-        ------
-        LandingError
-            A row lies beyond the artery.
+        A LandingError says that one of the rows, at arc lengths (rows,), lies beyond the artery.
         """
         check_inside(self.design, self.size, rows_mm, self.anatomy.parent.axis.length_mm)
         axis = self.anatomy.parent.axis
@@ -113,10 +102,6 @@ class AbstractMethod(ABC):
     contour: ActiveContour = field(default_factory=ActiveContour)
     """Active contour that carries the device to the wall, with its weights (Zhong et al. 2016, eq. 1-7)."""
 
-    def beside(self, dd_mm: float) -> Self:
-        """Return the method with the distance `dd_mm`, in mm, between contour and wall."""
-        return replace(self, contour=replace(self.contour, dd_mm=dd_mm))
-
     @abstractmethod
     def init(self, placement: Placement) -> Opened:
         """Return the closed device where it is to open."""
@@ -132,6 +117,32 @@ class AbstractMethod(ABC):
     @abstractmethod
     def result(self, placement: Placement, opened: Opened) -> Opened:
         """Return the deployed device after the last iteration."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Zhong2016(AbstractMethod):
+    """Deployment method that follows eq. (1-7) of Zhong et al. 2016 without changes.
+
+    The device is as long as its label states, with evenly spaced rows that start as circles of the maximum inscribed
+    spheres. It opens until 99 % of its nodes have met the wall, however wide the artery is. The wires can therefore
+    stretch, and the result cannot show gaps to the wall. `vstent.deployment.braid.ConstantWire` avoids both.
+    """
+
+    def init(self, placement: Placement) -> Opened:
+        """Return evenly spaced rows of inscribed circles over the label length."""
+        length_mm, rows = placement.size.compacted_length_mm, grid(placement.design, placement.size).rows
+        before_mm = {"proximal": 0.0, "center": 0.5 * length_mm, "distal": length_mm}[placement.landing.anchor]
+        rows_mm = placement.landing.abscissa_mm - before_mm + np.linspace(0.0, length_mm, rows)
+        return Opened(placement.start(self.contour, rows_mm), rows_mm)
+
+    def step(self, placement: Placement, opened: Opened) -> Opened:
+        """Return the device after one iteration of the active contour."""
+        return replace(opened, contour=self.contour.step(opened.contour, placement.wall))
+
+    def result(self, placement: Placement, opened: Opened) -> Opened:
+        """Return the contour as the last iteration left it."""
+        return opened
 
 
 @final
@@ -156,26 +167,7 @@ class Course:
 def run(method: AbstractMethod, placement: Placement, progress: Progress | None = None) -> Course:
     """Iterate a method until enough nodes terminate or the iteration limit is reached.
 
-    Parameters
-    ----------
-    method : AbstractMethod
-        The deployment method.
-    placement : Placement
-        The device and where it is landed.
-    progress : callable, optional
-        Called after every iteration.
-
-    Returns
-    -------
-    Course
-        The deployed device and the record of the iterations.
-
-    Raises
-    ------
-    LandingError
-        The device does not fit the artery.
-    InputError
-        The contour diverges because its weights are too large.
+    A LandingError says that the device does not fit the artery, an InputError that the contour diverges.
     """
     began = time.perf_counter()
     opened = method.init(placement)
@@ -183,7 +175,11 @@ def run(method: AbstractMethod, placement: Placement, progress: Progress | None 
     history, energies = [opened.contour.nodes_mm], [method.contour.energy_mm2(opened.contour)]
     while not method.terminate(opened) and len(fractions) < method.contour.iteration_limit:
         opened = method.step(placement, opened)
-        _check_finite(opened.contour, len(fractions) + 1)
+        if not np.isfinite(opened.contour.nodes_mm).all():
+            raise InputError(
+                f"The active contour diverged in iteration {len(fractions) + 1}, because its weights are too large. "
+                "Use a smaller tau."
+            )
         fractions.append(opened.contour.terminated_fraction)
         history.append(opened.contour.nodes_mm)
         energies.append(method.contour.energy_mm2(opened.contour))
@@ -196,31 +192,12 @@ def run(method: AbstractMethod, placement: Placement, progress: Progress | None 
     return Course(opened, outcome, tuple(fractions), tuple(energies), tuple(history), seconds)
 
 
-def _check_finite(state: State, iteration: int) -> None:
-    """Raise an InputError if the contour has diverged."""
-    if not np.isfinite(state.nodes_mm).all():
-        raise InputError(
-            f"The active contour diverged in iteration {iteration}, because its weights are too large. Use a "
-            "smaller tau."
-        )
-
-
 def laid_inside(lay: Callable[[Landing], Laid], proposed: Landing) -> Laid:
     """Deploy a device at the proposed place, and move it along the artery while it extends beyond an end.
 
-    The move is needed because the deployed length can only be estimated before deployment.
-
-    Parameters
-    ----------
-    lay : deploys or previews the device at a landing and raises a LandingError if it does not fit there.
-    proposed : where the device is tried first.
-
-    Returns return value of `lay` for the first landing that fits.
-
-    Raises
-    ------
-    LandingError
-        The device extends beyond the artery at every place tried, or moving it does not help.
+    The move is needed because the deployed length can only be estimated before deployment. `lay` deploys or previews
+    the device at a landing, and raises a LandingError if it does not fit there; its first result is returned. The error
+    is raised again where the device extends beyond the artery at every place tried, or moving it does not help.
     """
     landing = proposed
     for _ in range(MOVES):
@@ -234,13 +211,7 @@ def laid_inside(lay: Callable[[Landing], Laid], proposed: Landing) -> Laid:
 
 
 def check_landing(landing: Landing, artery_mm: float) -> None:
-    """Check that a landing point lies on an artery of length `artery_mm`, in mm.
-
-    Raises
-    ------
-    LandingError
-        The landing point lies beyond the artery.
-    """
+    """Raise a LandingError unless a landing point lies on an artery of length `artery_mm`."""
     if not 0 <= landing.abscissa_mm <= artery_mm:
         raise LandingError(
             f"A landing at {landing.abscissa_mm:.1f} mm is not on the parent artery, which spans "
@@ -249,13 +220,9 @@ def check_landing(landing: Landing, artery_mm: float) -> None:
 
 
 def check_inside(design: Design, size: Size, abscissa_mm: Floats, artery_mm: float) -> None:
-    """Check that rows at arc lengths (rows,), in mm, lie on an artery of length `artery_mm`, in mm.
+    """Raise a LandingError unless rows at arc lengths (rows,) lie on an artery of length `artery_mm`.
 
-    Raises
-    ------
-    LandingError
-        A row lies beyond the artery. The message states where the device would lie and what to do. The attribute
-        `move_mm` of the error is the distance by which to move the device.
+    Its message states where the device would lie and what to do, its attribute `move_mm` by how much to move it.
     """
     first, last = float(abscissa_mm[0]), float(abscissa_mm[-1])
     if first >= 0 and last <= artery_mm:

@@ -91,9 +91,11 @@ def landing_wall(anatomy: Anatomy, inside: Sequence[Stent] = ()) -> tuple[Abstra
         foot_mm = curves.project(anatomy.parent.axis.points_mm, surface.corners_mm.mean(axis=1))[0]
         first_mm, last_mm = stent.proximal_abscissa_mm + OVERLAP_MM, stent.distal_abscissa_mm - OVERLAP_MM
         is_open = (foot_mm < first_mm) | (foot_mm > last_mm)
-        surface = _joined(Surface(surface.vertices_mm, surface.faces[is_open]), inner_face(stent))
-        n_inner = len(surface.faces) - int(is_open.sum())
-        is_patient = np.concatenate([is_patient[is_open], np.zeros(n_inner, dtype=bool)])
+        inner, faces = inner_face(stent), surface.faces[is_open]
+        beyond = np.int32(len(surface.vertices_mm))
+        vertices_mm = np.concatenate([surface.vertices_mm, inner.vertices_mm])
+        surface = Surface(vertices_mm, np.concatenate([faces, inner.faces + beyond]))
+        is_patient = np.concatenate([is_patient[is_open], np.zeros(len(inner.faces), dtype=bool)])
     return TreeWall(surface), is_patient
 
 
@@ -101,9 +103,3 @@ def inner_face(stent: Stent) -> Surface:
     """Return the inner face of a device: its contour moved inward by the thickness of its mesh."""
     nodes_mm = stent.nodes_mm - stent.design.mesh_offset_um * MM_PER_UM * normals(stent.nodes_mm)
     return Surface(nodes_mm.reshape(-1, 3), stent.contour.faces)
-
-
-def _joined(first: Surface, second: Surface) -> Surface:
-    """Return two surfaces as one."""
-    vertices_mm = np.concatenate([first.vertices_mm, second.vertices_mm])
-    return Surface(vertices_mm, np.concatenate([first.faces, second.faces + np.int32(len(first.vertices_mm))]))

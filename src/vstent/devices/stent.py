@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from vstent.devices.design import Design, Size
-from vstent.devices.formulas import mesh_nodes
+from vstent.devices.formulas import grid, mesh_nodes
 from vstent.devices.treatment import ANCHORS, Anchor
 from vstent.errors import LandingError
 from vstent.geometry.surface import Surface
@@ -88,6 +88,16 @@ class Stent:
     def spacing_mm(self) -> float:
         """Distance between neighbouring wires of one of two hands, in mm: 2 area / length of all wires."""
         return 2 * self.contour.area_mm2 / self.wire_length_mm
+
+    @property
+    def joints_mm(self) -> Floats:
+        """(2, lattice rows, lattice columns, 3) junctions, in mm, as the struts below and above every row end there.
+
+        Both are the same where crowns are joined, and in braids.
+        """
+        shape = grid(self.design, self.size)
+        joined_mm = self.nodes_mm[:: shape.row_split, :: shape.column_split]
+        return joined_mm + (self.crown_shift_mm if self.crown_shift_mm.size else np.zeros((2, 1, 1, 1)))
 
     @cached_property
     def row_diameter_mm(self) -> Floats:

@@ -10,9 +10,9 @@ from typing import Final, NamedTuple, cast
 import numpy as np
 
 from vstent.anatomy.morphology import Measures
-from vstent.deployment.apposition import apposition
 from vstent.deployment.coverage import density
 from vstent.deployment.deploy import deploy
+from vstent.deployment.measure import apposition
 from vstent.devices.design import LaserCut, Range
 from vstent.devices.ranges import altered, values_at
 from vstent.devices.stent import Landing, Stent
