@@ -197,8 +197,7 @@ def _engine_of(case: FlowCase) -> type[AbstractEngine[Any]]:
 
 def _named(name: str, is_pulsatile: bool) -> type[AbstractEngine[Any]]:
     """Return the engine of a name."""
-    from vstent.flow.lattice.engine import LatticeBoltzmann
-    from vstent.flow.lattice.pulse import PulsatileLatticeBoltzmann
+    from vstent.flow.lattice.engine import LatticeBoltzmann, PulsatileLatticeBoltzmann
     from vstent.flow.openfoam.engine import OpenFoam
 
     lattice = PulsatileLatticeBoltzmann if is_pulsatile else LatticeBoltzmann

@@ -274,9 +274,9 @@ def resist(normal: Any, entry: Any, u: Any, blood: Any) -> tuple[Any, Any]:
     because wires that cross at right angles have half the drag along their plane. The equations are solved implicitly,
     so that there is no stability limit; |w| is found by two iterations from the linear resistances.
 
-    `normal` (3) is the unit normal of the screen, and `blood` the result of `rates`. `entry` holds the linear resistances
-    along the normal and across it and the quadratic one along it, per cell and time step, and the `spread` of
-    `of_thin_sheet`.
+    `normal` (3) is the unit normal of the screen, and `blood` the result of `rates`. `entry` holds the linear
+    resistances along the normal and across it and the quadratic one along it, per cell and time step, and the `spread`
+    of `of_thin_sheet`.
     """
     blood = blood[0], blood[1] * squared_reach(normal)
     through = u[0] * normal[0] + u[1] * normal[1] + u[2] * normal[2]
