@@ -31,9 +31,8 @@ from vstent.flow import sampling
 from vstent.flow.case import PHASES, FlowCase, FlowField
 from vstent.flow.engines import Outcome
 from vstent.flow.indices import indices
-from vstent.flow.lattice.engine import LatticeBoltzmann
+from vstent.flow.lattice.engine import LatticeBoltzmann, PulsatileLatticeBoltzmann
 from vstent.flow.lattice.kernels import d3q19, lanes
-from vstent.flow.lattice.pulse import PulsatileLatticeBoltzmann
 from vstent.flow.lattice.reading import field_of, read
 from vstent.flow.lattice.stepping import snapshot
 from vstent.flow.problem import flow_case, vessel_case

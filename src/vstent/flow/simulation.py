@@ -133,8 +133,7 @@ def memory_bytes(case: FlowCase) -> float | None:
 
 def engine_class(numerics: Numerics, *, is_pulsatile: bool) -> type[AbstractEngine[Any]]:
     """Return the engine that the settings name: one of vstent's own or a plug-in; unsupported settings are refused."""
-    from vstent.flow.lattice.engine import LatticeBoltzmann
-    from vstent.flow.lattice.pulse import PulsatileLatticeBoltzmann
+    from vstent.flow.lattice.engine import LatticeBoltzmann, PulsatileLatticeBoltzmann
     from vstent.flow.openfoam.engine import OpenFoam
 
     lattice = PulsatileLatticeBoltzmann if is_pulsatile else LatticeBoltzmann

@@ -25,10 +25,9 @@ from vstent.flow.engines import AbstractEngine, run
 from vstent.flow.indices import indices
 from vstent.flow.lattice import close_up as close_ups
 from vstent.flow.lattice.cost import estimate
-from vstent.flow.lattice.engine import LatticeBoltzmann
+from vstent.flow.lattice.engine import LatticeBoltzmann, PulsatileLatticeBoltzmann
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.pace import peak_speed_m_s
-from vstent.flow.lattice.pulse import PulsatileLatticeBoltzmann
 from vstent.flow.lattice.setup import thickest
 from vstent.flow.lattice.stepping import build, imposed, snapshot, take_pace
 from vstent.flow.problem import flow_case, vessel_case

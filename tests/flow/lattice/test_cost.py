@@ -13,8 +13,7 @@ from vstent.flow import domain
 from vstent.flow.case import PHASES, Target
 from vstent.flow.engines import DivergenceError
 from vstent.flow.lattice.cost import MOST_CELLS, block_rate, estimate, refuse_too_large
-from vstent.flow.lattice.engine import LatticeBoltzmann
-from vstent.flow.lattice.pulse import PulsatileLatticeBoltzmann
+from vstent.flow.lattice.engine import LatticeBoltzmann, PulsatileLatticeBoltzmann
 from vstent.flow.memory import free_memory_bytes
 from vstent.flow.problem import vessel_case
 from vstent.flow.settings import FlowSettings, Numerics

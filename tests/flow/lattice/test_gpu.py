@@ -25,9 +25,8 @@ from vstent.flow.lattice import state as lattice_state
 from vstent.flow.lattice import stepping
 from vstent.flow.lattice.checkpoint import pack
 from vstent.flow.lattice.cost import GPU_BYTES_PER_CELL, estimate, refuse_too_large
-from vstent.flow.lattice.engine import LatticeBoltzmann
+from vstent.flow.lattice.engine import LatticeBoltzmann, PulsatileLatticeBoltzmann
 from vstent.flow.lattice.kernels import d3q19
-from vstent.flow.lattice.pulse import PulsatileLatticeBoltzmann
 from vstent.flow.lattice.recording import NotRecordedError, Pairs, plan, recorded
 from vstent.flow.lattice.setup import Grid
 from vstent.flow.problem import vessel_case

@@ -13,8 +13,8 @@ from vstent.errors import InputError
 from vstent.flow import domain, sampling
 from vstent.flow import simulation as flow
 from vstent.flow.case import PHASES, FlowField
+from vstent.flow.lattice import engine as lattice_engine
 from vstent.flow.lattice import pace as lattice_pace
-from vstent.flow.lattice import pulse as lattice_pulse
 from vstent.flow.lattice.pace import pace
 from vstent.flow.problem import vessel_case
 from vstent.flow.settings import FlowSettings, Numerics, Waveform
@@ -39,7 +39,7 @@ def in_steps(longer: float) -> FlowField:
     """The same in steps that are by turns the shortest and so many times as long."""
     with pytest.MonkeyPatch.context() as patch:
         steps = 2 * np.rint(400 / np.tile([1, longer], PHASES // 2)).astype(int)
-        patch.setattr(lattice_pulse, "pace", lambda *case: steps)
+        patch.setattr(lattice_engine, "pace", lambda *case: steps)
         return pulsing.__wrapped__()
 
 

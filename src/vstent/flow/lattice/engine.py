@@ -1,25 +1,25 @@
-"""The embedded engine for steady inflow: sparse D3Q19 lattice-Boltzmann, single precision, interpolated walls."""
+"""The embedded engine: sparse D3Q19 lattice-Boltzmann, single precision, interpolated walls; steady or pulsatile."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar, Final
 
 import numpy as np
 
-from vstent.flow.case import FlowCase, FlowField
+from vstent.flow.case import PHASES, FlowCase, FlowField, Phase
 from vstent.flow.engines import AbstractEngine, Outcome, Saved
 from vstent.flow.lattice import close_up as close_ups
+from vstent.flow.lattice import stepping
 from vstent.flow.lattice.checkpoint import pack, unpack
 from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.cost import estimate, memory_bytes, refuse_too_large
 from vstent.flow.lattice.gpu import require_gpu
 from vstent.flow.lattice.kernels import d3q19
-from vstent.flow.lattice.pace import longest_step_s, peak_speed_m_s
+from vstent.flow.lattice.pace import longest_step_s, pace, peak_speed_m_s
 from vstent.flow.lattice.reading import field_of, read, read_moving
 from vstent.flow.lattice.settling import CHECKS_APART, Mean, left_to_settle, mean_of, with_check
 from vstent.flow.lattice.state import State
-from vstent.flow.lattice.stepping import build, is_at_check, prepare, step
 from vstent.flow.lattice.trouble import trouble
-from vstent.flow.stopping import SURE, swings
+from vstent.flow.stopping import SURE, cycle_change, cycles_advice, swings
 from vstent.units import M_PER_MM
 
 CHECK_DIAMETERS = 0.5
@@ -74,14 +74,10 @@ class AbstractLattice(AbstractEngine[State]):
         """Return the refined region of a case; None: the grid covers the whole vessel."""
         return None if self.outer is None else close_ups.close_up(case, self.outer)
 
-    def pacing(self, start: FlowField | None) -> FlowField | None:
-        """Return the flow that sets the time step: the one around a refined region, else the one it starts from."""
-        return start if self.outer is None else self.outer
-
     def prepare(self, case: FlowCase) -> None:
         """Build the grid of the whole vessel; that of a refined sac depends on the flow around it."""
         if self.outer is None:
-            prepare(case, self.cell_size_mm)
+            stepping.prepare(case, self.cell_size_mm)
 
     def save(self, state: State) -> Saved:
         """Return the run as arrays."""
@@ -93,7 +89,7 @@ class AbstractLattice(AbstractEngine[State]):
 
     def step(self, state: State) -> State:
         """Advance the run towards its next check."""
-        step(state)
+        stepping.step(state)
         return state
 
     def trouble(self, state: State) -> str:
@@ -109,16 +105,19 @@ class LatticeBoltzmann(AbstractLattice):
         """Set up a run whose fastest blood moves `lattice_speed` cells a step (times `STRETCH` in a refined region)."""
         close_up = self.close_up(case)
         stretch = 1 if close_up is None else close_ups.STRETCH
-        peak_m_s = peak_speed_m_s(case, self.pacing(start), close_up)
+        peak_m_s = peak_speed_m_s(case, self.outer or start, close_up)
         step_s = stretch * longest_step_s(case, self.cell_size_mm, peak_m_s)
-        steps = _steps_per_check(case, step_s)
-        pace, kept = np.array([steps]), 2 * CHECKS_APART + 1
-        return build(case, self.cell_size_mm, steps * step_s, pace, close_up=close_up, start=start, kept=kept)
+        check_s = CHECK_DIAMETERS * case.vessel.inlet.diameter_mm * M_PER_MM / float(case.inlet_speeds_m_s[0])
+        steps = 2 * max(1, round(0.5 * min(check_s / step_s, case.numerics.max_steps / LEAST_CHECKS)))
+        kept = 2 * CHECKS_APART + 1
+        return stepping.build(
+            case, self.cell_size_mm, steps * step_s, np.array([steps]), close_up=close_up, start=start, kept=kept
+        )
 
     def step(self, state: State) -> State:
         """Advance the run towards its next check and, at a check, update the block means."""
         super().step(state)
-        if is_at_check(state):
+        if stepping.is_at_check(state):
             state.blocks = with_check(state.blocks, state.snapshots[-1])
         return state
 
@@ -127,7 +126,7 @@ class LatticeBoltzmann(AbstractLattice):
 
         None between checks; nan when the run has diverged.
         """
-        if not is_at_check(state):
+        if not stepping.is_at_check(state):
             return None
         if state.snapshots[-1].is_lost:
             return float("nan")
@@ -148,24 +147,52 @@ class LatticeBoltzmann(AbstractLattice):
         return field_of(state, read_moving(state, state.blocks[-mean.blocks :]), outcome, uncertain, advice)
 
 
-def _steps_per_check(case: FlowCase, step_s: float) -> int:
-    """Return the even number of time steps between checks."""
-    steps = CHECK_DIAMETERS * case.vessel.inlet.diameter_mm * M_PER_MM / float(case.inlet_speeds_m_s[0]) / step_s
-    return 2 * max(1, round(0.5 * min(steps, case.numerics.max_steps / LEAST_CHECKS)))
+@dataclass(frozen=True)
+class PulsatileLatticeBoltzmann(AbstractLattice):
+    """The sparse D3Q19 engine whose inflow follows a waveform until two cycles agree."""
+
+    def init(self, case: FlowCase, start: FlowField | None) -> State:
+        """Set up a run whose time steps divide each phase, with a peak speed below `lattice_speed` cells per step."""
+        close_up, phase_s = self.close_up(case), case.pulse.period_s / PHASES
+        steps = pace(case, self.cell_size_mm, self.outer or start, close_up)
+        return stepping.build(case, self.cell_size_mm, phase_s, steps, close_up=close_up, start=start, kept=PHASES)
+
+    def terminate(self, state: State) -> float | None:
+        """Return the relative difference of the monitored quantities between the last two cycles.
+
+        None between checks; inf within a cycle; nan when the run has diverged.
+        """
+        if not stepping.is_at_check(state):
+            return None
+        return float("nan") if state.snapshots[-1].is_lost else cycle_change(np.array(state.history))
+
+    def max_checks(self, state: State) -> int:
+        """Return the number of phases in the maximum number of cycles."""
+        return PHASES * state.case.numerics.max_cycles
+
+    def result(self, state: State, outcome: Outcome) -> FlowField:
+        """Return the mean flow of the last cycle, with its phases."""
+        phases = []
+        for k, snapshot in enumerate(state.snapshots):
+            flow = read(state, [snapshot])
+            moment = (flow.velocity_m_s,), (flow.pressure_Pa,), flow.wall_shear_stress_Pa
+            phases.append(Phase((k + 1) * state.check_s, flow.inlets_mL_s, flow.outlets_mL_s, *moment))
+        changes = np.array([change for change in outcome.residual if np.isfinite(change)])
+        advice = cycles_advice(changes, len(state.history) // PHASES, is_converged=outcome.is_converged)
+        # For shear-thinning blood the wall shear stress of the mean flow differs from the mean wall shear stress.
+        mean_Pa = np.asarray(np.mean([phase.wall_shear_stress_Pa for phase in phases], axis=0, dtype=np.float64))
+        flow = replace(read(state, list(state.snapshots)), wall_shear_stress_Pa=mean_Pa)
+        return field_of(state, flow, outcome, outcome.residual[-1], advice, tuple(phases))
 
 
 def _left(state: State) -> float:
     """Return the estimated relative distance of the run from convergence."""
     fields = [one.velocity[state.probe.cells] for one in state.snapshots]
-    return max(left_to_settle(np.array(state.history), fields), INFLOW_WEIGHT * _inflow_error(state))
-
-
-def _inflow_error(state: State) -> float:
-    """Return the relative error of the inflow, which is not zero while sound waves leave through the openings."""
-    links = state.links
-    enters = links.is_inflow
+    links, enters = state.links, state.links.is_inflow
     wanted = (links.wanted * links.openings[:, d3q19.AREA])[enters]
-    return float(np.abs(state.snapshots[-1].outflow[enters] + wanted).sum() / wanted.sum())
+    # Not zero while sound waves leave through the openings.
+    inflow_error = float(np.abs(state.snapshots[-1].outflow[enters] + wanted).sum() / wanted.sum())
+    return max(left_to_settle(np.array(state.history), fields), INFLOW_WEIGHT * inflow_error)
 
 
 def _mean(state: State) -> Mean:

@@ -175,11 +175,8 @@ def tables_of(state: State) -> Tables:
     special[5, np.searchsorted(cell, screened)] = entries
     code = layout.segment.copy()
     code[cell] = -1 - np.arange(len(cell), dtype=np.int32)
-    of_run: dict[Name, Ints] = {
-        "code": code,
-        kernels.SPECIAL: special,
-        kernels.GROUP_MEMBER: refilled[state.refill.groups[3]],
-    }
+    members = refilled[state.refill.groups[3]]
+    of_run: dict[Name, Ints] = {"code": code, kernels.SPECIAL: special, kernels.GROUP_MEMBER: members}
     integers, of_integers = joined(layout.tables | of_run, np.int32)
     places |= of_doubles | of_integers
     head = {name: place.start for name, place in places.items() if isinstance(name, int)} | {

@@ -249,16 +249,9 @@ def of_thin_sheet(across: Any, spread: Any, through: Any, blood: Any) -> tuple[A
       the odd part. The term stems from the second difference of the force. With L far below 1/4 the drag of a dense
       braid would be twice its true value.
 
-    Parameters
-    ----------
-    across
-        Tangential resistance of the cell per time step.
-    spread
-        Sum of a b d R over all pairs of layers, R being the resistance of the whole sheet.
-    through
-        Velocity normal to the sheet.
-    blood
-        Viscosity, and 1/4 - L times `squared_reach`.
+    `across` is the tangential resistance of the cell per time step; `spread` the sum of a b d R over all pairs of
+    layers, R being the resistance of the whole sheet; `through` the velocity normal to the sheet; `blood` the viscosity
+    and 1/4 - L times `squared_reach`.
 
     References
     ----------
@@ -281,13 +274,9 @@ def resist(normal: Any, entry: Any, u: Any, blood: Any) -> tuple[Any, Any]:
     because wires that cross at right angles have half the drag along their plane. The equations are solved implicitly,
     so that there is no stability limit; |w| is found by two iterations from the linear resistances.
 
-    Parameters
-    ----------
-    normal : unit normal of the screen (3).
-    entry : linear resistance along the normal, linear resistance across it, quadratic resistance along it, all per
-        cell and time step, and the `spread` of `of_thin_sheet`.
-    u : velocity without the screen (3).
-    blood : result of `rates`.
+    `normal` (3) is the unit normal of the screen, and `blood` the result of `rates`. `entry` holds the linear
+    resistances along the normal and across it and the quadratic one along it, per cell and time step, and the `spread`
+    of `of_thin_sheet`.
     """
     blood = blood[0], blood[1] * squared_reach(normal)
     through = u[0] * normal[0] + u[1] * normal[1] + u[2] * normal[2]
@@ -363,11 +352,8 @@ def rescaled(f: Any, stretch: Any, stress: Any) -> tuple[Any, ...]:
     the square, because it is the density gradient. In a screen the momentum differs from that of the flow by half the
     force. This difference is not rescaled exactly, with an effect on a single step.
 
-    Parameters
-    ----------
-    f : populations (19), an array.
-    stretch : ratio of the new to the old time step.
-    stress : factor of the stress: `stretch` times the ratio of the relaxation times.
+    `stretch` is the ratio of the new to the old time step, `stress` the product of it and the ratio of the relaxation
+    times.
 
     References
     ----------

@@ -28,13 +28,13 @@ from vstent.flow.lattice.kernels.collision import (
     collided,
     collided_screened,
     rates,
-    relaxed_pair,
+    relaxed,
     rescaled,
     resist,
     stress_size,
     thinned,
 )
-from vstent.flow.lattice.kernels.lanes import COUNT, fetch, gather, load, starts, store
+from vstent.flow.lattice.kernels.lanes import COUNT, fetch, gather, load, scatter, starts
 from vstent.kernels.arrays import Floats, Ints
 from vstent.kernels.directions import VELOCITIES
 
@@ -97,32 +97,9 @@ def even_part(q: int, density: float, ux: float, uy: float, uz: float) -> float:
 def _thin(f: Any, start: Any, n: int, time: float, law: Any, times: Any) -> None:
     """Write the relaxation times of a segment of n cells of shear-thinning blood, from the stress they hold."""
     for k in range(0, n, COUNT):
-        store(times, k, stress_size(gather(f, start, k)), COUNT)
+        scatter(times, (0,), k, (stress_size(gather(f, start, k)),), COUNT)
     for k in range(n):
         times[k] = thinned(times[k], time, law)
-
-
-@njit(cache=True, forceinline=True, error_model="numpy")
-def _relax_pair(pair: int, f: Any, start: Any, k: int, cells: int, old: Any, parts: Any) -> None:
-    """Relax the populations of a pair of opposite directions (see `_relax`)."""
-    new_a, new_b = relaxed_pair(old[2 * pair - 1], old[2 * pair], parts[0][pair], parts[1][pair - 1], parts[2])
-    store(f, start[2 * pair - 1] + k, new_a, cells)
-    store(f, start[2 * pair] + k, new_b, cells)
-
-
-@njit(cache=True, forceinline=True, error_model="numpy")
-def _relax(f: Any, start: Any, k: int, cells: int, old: Any, parts: Any) -> None:
-    """Relax the cells of a segment from `k` on, a vector but no more than `cells`, with the parts from `collided`."""
-    _relax_pair(1, f, start, k, cells, old, parts)
-    _relax_pair(2, f, start, k, cells, old, parts)
-    _relax_pair(3, f, start, k, cells, old, parts)
-    _relax_pair(4, f, start, k, cells, old, parts)
-    _relax_pair(5, f, start, k, cells, old, parts)
-    _relax_pair(6, f, start, k, cells, old, parts)
-    _relax_pair(7, f, start, k, cells, old, parts)
-    _relax_pair(8, f, start, k, cells, old, parts)
-    _relax_pair(9, f, start, k, cells, old, parts)
-    store(f, start[0] + k, parts[0][0], cells)
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
@@ -131,7 +108,8 @@ def _collide(f: Any, start: Any, k: int, cells: int, settings: Any) -> None:
     times, limit, odd_rate = settings
     old = gather(f, start, k)
     fetch(f, start, k + _AHEAD)
-    _relax(f, start, k, cells, old, collided(old, load(times, k), limit, odd_rate))
+    even, odd, half_kept = collided(old, load(times, k), limit, odd_rate)
+    scatter(f, start, k, relaxed(old, even, odd, half_kept), cells)
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
@@ -142,7 +120,8 @@ def _collide_screened(f: Any, start: Any, k: int, cells: int, settings: Any, res
     linear = load(resistance, k + 3 * _WIDE), load(resistance, k + 4 * _WIDE)
     entry = *linear, load(resistance, k + 5 * _WIDE), load(resistance, k + 6 * _WIDE)
     old = gather(f, start, k)
-    _relax(f, start, k, cells, old, collided_screened(old, load(times, k), limit, odd_rate, normal, entry))
+    even, odd, half_kept = collided_screened(old, load(times, k), limit, odd_rate, normal, entry)
+    scatter(f, start, k, relaxed(old, even, odd, half_kept), cells)
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
@@ -199,15 +178,6 @@ def _reflect(f: Any, path: Any, weight: Any, source: Any, k: int) -> None:
     f[target] = weight[link, 0] * f[first] + weight[link, 1] * f[second] + source[link]
 
 
-@njit(cache=True)
-def _swap(f: Any, septa: Any, k: int) -> None:
-    """Exchange the populations that two blood cells would send each other through septum `k`."""
-    first, second = _U(septa[0, k]), _U(septa[1, k])
-    kept = f[first]
-    f[first] = f[second]
-    f[second] = kept
-
-
 @njit(cache=True, fastmath=True, error_model="numpy")
 def _do(stage: int, band: int, f: Any, cells: Any, links: Any, bands: Any, scratch: Any) -> None:
     """Apply a stage of a step to a band (see `_KINDS`)."""
@@ -226,7 +196,10 @@ def _do(stage: int, band: int, f: Any, cells: Any, links: Any, bands: Any, scrat
             _reflect(f, path[step], weight, source, of_ends[n])
     else:
         for k in range(here[4], beyond[4]):
-            _swap(f, septa, k)
+            first, second = _U(septa[0, k]), _U(septa[1, k])
+            through = f[first]
+            f[first] = f[second]
+            f[second] = through
 
 
 @njit(cache=True)
@@ -254,31 +227,25 @@ def update(f: Any, cells: Any, links: Any, bands: Any, shares: Any) -> None:
 
     Parameters
     ----------
-    f : (19 * stride + COUNT,) float32
-        Populations, changed in place. Up to COUNT - 1 values beyond a segment may be read; they have no effect.
+    f : (19 * stride + COUNT,) float32; populations. Up to COUNT - 1 values beyond a segment are read without effect.
     cells : tuple
         - (steps, segments, 19) int32: address of the first population of each segment and direction, in an even step
           its own, in an odd step its neighbours'.
         - (segments,) int32: number of cells of each segment, at most SEGMENT.
-        - Relaxation, a tuple: float32 relaxation time of the stress at high shear rate; (4,) float32 Carreau-Yasuda
-          law, which holds the additional relaxation time at rest (0: Newtonian), the time constant, and the exponents a
-          and (n - 1) / a; (segments,) float32 largest grid Reynolds number, speed divided by viscosity, above which the
+        - Relaxation: float32 relaxation time of the stress at high shear rate; (4,) float32 Carreau-Yasuda law, which
+          holds the additional relaxation time at rest (0: Newtonian), the time constant, and the exponents a and
+          (n - 1) / a; (segments,) float32 largest grid Reynolds number, speed divided by viscosity, above which the
           viscosity is raised; float32 relaxation rate of the odd part.
-        - Screen, a tuple: (segments + 1,) int32 first entry of every segment; (e,) int32 position within the segment;
-          (e, ENTRY) float32 unit normal and resistance (see `resist`).
-    links : tuple
-        - (steps, l, 3) addresses of two populations read and one written (see `paths`).
-        - (l, 2) float32 weights.
-        - (l,) float32 sources.
-        - (o,) int32 links of the ends.
-        - (w,) int32 addresses of rest populations to which the next array is added.
-        - (w,) float32 values added.
-        - (2, t) int32 addresses of populations exchanged at septa, that is, at a wall between two blood cells.
-    bands : (bands + 1, 5) int32
-        First segment, rest population, wall link, end link and septum of every band, and one past the last. What leaves
-        a cell stays in its band or enters an adjacent one. Septa lie between their band and the next.
-    shares : (threads + 1,) int32
-        First band of every thread, and the number of bands (see `share`).
+        - Screen: (segments + 1,) int32 first entry of every segment; (e,) int32 position within the segment; (e, ENTRY)
+          float32 unit normal and resistance (see `resist`).
+    links : tuple; (steps, l, 3) addresses of two populations read and one written (see `paths`), (l, 2) float32
+        weights, (l,) float32 sources, (o,) int32 links of the ends, (w,) int32 addresses of rest populations and (w,)
+        float32 values added to them, and (2, t) int32 addresses of populations exchanged at septa, that is, at a wall
+        between two blood cells.
+    bands : (bands + 1, 5) int32; first segment, rest population, wall link, end link and septum of every band, and one
+        past the last. What leaves a cell stays in its band or enters an adjacent one. Septa lie between their band and
+        the next.
+    shares : (threads + 1,) int32; first band of every thread, and the number of bands (see `share`).
 
     References
     ----------
@@ -307,19 +274,7 @@ def update(f: Any, cells: Any, links: Any, bands: Any, shares: Any) -> None:
 
 
 def share(length: Ints, screen_start: Ints, bands: Ints, threads: int) -> Ints:
-    """Return the `shares` of `update` with which all threads have about the same work.
-
-    Parameters
-    ----------
-    length : (s,) int
-        Number of cells of every segment.
-    screen_start : (s + 1,) int
-        First screen entry of every segment.
-    bands : (b + 1, 5) int
-        As in `update`.
-    threads : int
-        Number of threads.
-    """
+    """Return the `shares` of `update` with which all threads have about the same work."""
     vectors = -(-length // COUNT) * np.where(np.diff(screen_start) > 0, SCREENED_WORK, 1.0)
     done = np.r_[0.0, np.cumsum(vectors)][bands[:, 0]] + LINK_WORK * (bands[:, 2] - bands[0, 2] + bands[:, 3])
     wanted = done[-1] * np.arange(threads + 1) / threads
@@ -349,10 +304,7 @@ def no_screen(segments: int) -> tuple[Ints, Ints, NDArray[np.float32]]:
 
 
 def addresses(place: Ints, behind: Sequence[Ints], stride: int) -> Ints:
-    """Return the address (2, s, 19) of the first population of every segment and direction, in an even and an odd step.
-
-    Shapes: `place` (s,), `behind` (s,).
-    """
+    """Return the addresses (2, s, 19) of the first populations of segments, in an even and an odd step."""
     own = place[:, None] + stride * np.arange(19)
     neighbours = np.stack([OPPOSITE[q] * stride + behind[q] for q in range(19)], axis=1)
     return np.stack([own, neighbours]).astype(np.int32)
@@ -361,18 +313,13 @@ def addresses(place: Ints, behind: Sequence[Ints], stride: int) -> Ints:
 def paths(address: Ints, weight: Floats) -> tuple[Ints, NDArray[np.float32]]:
     """Return the addresses and weights with which `update` reflects at links.
 
-    Parameters
-    ----------
-    address : (links, 6); addresses after an even step of the populations that leave along the link (a), left the cell
-        behind (b), leave against the link (c), and of the mailbox (d). For `defer`: of those that left the second cell
-        behind (e) and leave the cell behind against the link (g). After an odd step a and d, b and c, e and g change
-        roles.
-    weight : (links, 3); weights of a, b and c; that of b or of c is zero.
+    The addresses (l, 6) are, after an even step, those of the populations that leave along the link (a), left the cell
+    behind (b), leave against the link (c), and of the mailbox (d); for `defer`, of those that left the second cell
+    behind (e) and leave the cell behind against the link (g). After an odd step a and d, b and c, e and g change roles.
+    Of the weights (l, 3) of a, b and c, that of b or of c is zero.
 
-    Returns
-    -------
-    path : (2, links, 3); addresses read (two) and written (one), after an even and after an odd step.
-    weight : (links, 2) float32; weights of the two populations read.
+    Returned are the addresses (2, l, 3) read (two) and written (one), after an even and after an odd step, and the
+    weights (l, 2) of the two populations read.
     """
     needs_c = weight[:, 2] != 0
     after_even = np.where(needs_c[:, None], address[:, (0, 2, 3)], address[:, (0, 1, 3)])
@@ -391,16 +338,6 @@ def deferred(held: Any, weight: Any) -> Any:
     return wanted + weight[3] * held[3] + weight[4] * held[4]
 
 
-@njit(cache=True, fastmath=True, forceinline=True)
-def defer_link(k: int, f: Any, address: Any, correction: Any, source: Any, lost: Any, part: float) -> None:
-    """Apply `defer` to link `k`."""
-    a, b, c = _U(address[k, 3]), _U(address[k, 2]), _U(address[k, 1])
-    e, g = _U(address[k, 5]), _U(address[k, 4])
-    lost[k] = f[a] - f[_U(address[k, 0])]
-    weight = correction[k, 0], correction[k, 1], correction[k, 2], correction[k, 3], correction[k, 4]
-    source[k] += part * (deferred((f[a], f[b], f[c], f[e], f[g]), weight) - source[k])
-
-
 @njit(cache=True, parallel=True, fastmath=True)
 def defer(f: Any, address: Any, correction: Any, source: Any, lost: Any, part: float) -> None:
     """Move the sources of wall links towards the difference between higher-order and linear interpolation.
@@ -408,21 +345,19 @@ def defer(f: Any, address: Any, correction: Any, source: Any, lost: Any, part: f
     Higher-order bounce-back can be unstable. As a lagged correction it is stable, with the same steady state. Call it
     when populations are at home.
 
-    Parameters
-    ----------
-    f : float32; populations.
-    address : (links, 6); as in `paths`.
-    correction : (links, 5) float32; weights of a, b, c, e and g.
-    source : (links,) float32; sources, changed in place.
-    lost : (links,) float32; set to the mass that each link loses.
-    part : Under-relaxation factor.
+    Addresses (links, 6) are those of `paths`, weights (links, 5) those of a, b, c, e and g; `lost` (links,) is set to
+    the mass that each link loses, and `part` is the under-relaxation factor.
 
     References
     ----------
     Khosla and Rubin 1974, Comput. Fluids 2, 207: deferred correction.
     """
     for k in prange(len(address)):
-        defer_link(k, f, address, correction, source, lost, part)
+        a, b, c = _U(address[k, 3]), _U(address[k, 2]), _U(address[k, 1])
+        e, g = _U(address[k, 5]), _U(address[k, 4])
+        lost[k] = f[a] - f[_U(address[k, 0])]
+        weight = correction[k, 0], correction[k, 1], correction[k, 2], correction[k, 3], correction[k, 4]
+        source[k] += part * (deferred((f[a], f[b], f[c], f[e], f[g]), weight) - source[k])
 
 
 @njit(cache=True, forceinline=True)
@@ -442,13 +377,9 @@ def balance_group(g: int, lost: Any, groups: Any, refill: Any, part: float) -> N
 def balance(lost: Any, groups: Any, refill: Any, part: float) -> None:
     """Move the refill of wall cells towards the mass lost at interpolated walls, averaged over groups of cells.
 
-    Parameters
-    ----------
-    lost : (links,) float32; mass that each wall link loses (see `defer`).
-    groups : tuple; (g + 1,) first link of every group, (links,) links sorted by group, and the same two arrays for
-        wall cells.
-    refill : (w,) float32; mass added to every wall cell per step, changed in place.
-    part : Under-relaxation factor.
+    `lost` (links,) is the mass that each wall link loses (see `defer`), `refill` (w,) the mass added to every wall cell
+    per step, and `part` the under-relaxation factor. Groups are (g + 1,) first link of each, (links,) links sorted by
+    group, and the same two arrays for wall cells.
     """
     for g in prange(len(groups[0]) - 1):
         balance_group(g, lost, groups, refill, part)
@@ -519,10 +450,7 @@ def relaxation_times(f: Any, stride: int, places: Any, time: float, law: Any) ->
 
 @njit(cache=True)
 def resisted(velocity: Any, entries: Any, times: Any, odd_rate: float) -> Any:
-    """Return the half-force velocity (e, 3) of cells in a screen.
-
-    Shapes: `velocity` (e, 3), `entries` (e, ENTRY), `times` (e,).
-    """
+    """Return the half-force velocity (e, 3) of cells in a screen from that without the force."""
     result = np.zeros_like(velocity)
     for e in range(len(entries)):
         normal, entry = entries[e, :3], entries[e, 3:]
@@ -535,14 +463,8 @@ def resisted(velocity: Any, entries: Any, times: Any, odd_rate: float) -> Any:
 def answered(opening: Any, measured: float) -> float:
     """Return the speed of an inflow, or the density deviation of an outlet, during the next two steps (see `drive`).
 
-    It depends on the opening's condition only here.
-
-    Parameters
-    ----------
-    opening : (`OPENING`,)
-        As in `drive`; its own densities change in place.
-    measured : float
-        Mean density deviation at an inflow; flow rate out of any other opening, in cells per time step.
+    It depends on the opening's condition only here. The opening's own densities change in place. Measured are the mean
+    density deviation at an inflow, and the flow rate out of any other opening, in cells per time step.
     """
     answer: float = opening[WANTED]
     if opening[KIND] == INFLOW:
@@ -589,17 +511,6 @@ def _at_ends(f: Any, stride: int, start: Any, places: Any) -> Any:
 
 
 @njit(cache=True)
-def _mean_density(held: Any, places: Any) -> float:
-    """Return the density deviation at `places`, averaged over the links they belong to (see `_at_ends`)."""
-    total, density = 0.0, 0.0
-    for n in range(len(places)):
-        if n == 0 or places[n] != places[n - 1]:
-            density = held[n, 0]
-        total += density
-    return total / len(places)
-
-
-@njit(cache=True)
 def outflow(f: Any, address: Any) -> float:
     """Return the flow rate out through links with addresses (l, 6); populations must be at home."""
     total = 0.0
@@ -621,8 +532,6 @@ def drive(f: Any, stride: int, openings: Any, links: Any, moment: Any, source: A
     Outflow: the density answers an excess of speed like an outgoing wave would, about a mean that changes until there
     is no excess.
 
-    Shapes: `links` (k + 1,), `moment` (3,), `source` (l,).
-
     References
     ----------
     Ladd 1994, J. Fluid Mech. 271, 285: moving wall.
@@ -634,7 +543,12 @@ def drive(f: Any, stride: int, openings: Any, links: Any, moment: Any, source: A
     for k in range(len(openings)):
         opening, first, last = openings[k], start[k], start[k + 1]
         if opening[KIND] == INFLOW:
-            speed = answered(opening, _mean_density(held[first:last], place[first:last]))
+            total, density = 0.0, 0.0
+            for n in range(first, last):
+                if n == first or place[n] != place[n - 1]:
+                    density = held[n, 0]
+                total += density
+            speed = answered(opening, total / (last - first))
             for n in range(first, last):
                 linear, squared = between(shape, n, moment)
                 source[n] = (linear + squared * speed) * speed

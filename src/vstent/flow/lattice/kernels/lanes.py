@@ -52,53 +52,40 @@ def _everywhere(builder: Any, number: Any) -> Any:
     return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(_WHOLE, COUNT), [0] * COUNT))
 
 
-def _widened(builder: Any, kind: Any, value: Any) -> Any:
-    """Return a vector with the same number in every place; Lanes are returned unchanged."""
-    return value if kind == LANES else _everywhere(builder, value)
-
-
-def _is_pair(a: Any, b: Any) -> bool:
-    """Return whether both types are Lanes or float32 and at least one is Lanes."""
-    return LANES in (a, b) and {a, b} <= {LANES, types.float32}
-
-
-def _arithmetic(operation: Callable[..., Any], instruction: str) -> None:
-    """Make numba apply an operator to two Lanes, or to Lanes and a number."""
+def _on_pairs(function: Callable[..., Any], of_vectors: Callable[..., Any], of_numbers: Any = None) -> None:
+    """Make numba apply a function to two Lanes, or to Lanes and a number: what `of_vectors` builds from two vectors."""
 
     @intrinsic
     def apply(_: Any, a: Any, b: Any) -> Any:
         def generate(_: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            pair = [_widened(builder, *one) for one in zip(signature.args, arguments, strict=True)]
-            return getattr(builder, instruction)(*pair, flags=_FAST)
+            pairs = zip(signature.args, arguments, strict=True)
+            return of_vectors(builder, *(x if kind == LANES else _everywhere(builder, x) for kind, x in pairs))
 
         return LANES(a, b), generate
 
-    @overload(operation)
+    @overload(function)
     def chosen(a: Any, b: Any) -> Any:
         def on_lanes(a: Any, b: Any) -> Any:
             return apply(a, b)
 
-        return on_lanes if _is_pair(a, b) else None
+        return on_lanes if LANES in (a, b) and {a, b} <= {LANES, types.float32} else of_numbers
 
 
-for _operation, _instruction in (
-    (operator.add, "fadd"),
-    (operator.sub, "fsub"),
-    (operator.mul, "fmul"),
-    (operator.truediv, "fdiv"),
-):
-    _arithmetic(_operation, _instruction)
+def larger(a: Any, b: Any) -> Any:
+    """Return the larger of two values element by element; values may be Lanes or float32."""
+    return np.maximum(a, b)
 
 
-@intrinsic
-def _larger(_: Any, a: Any, b: Any) -> Any:
-    """Return the larger of two Lanes, element by element."""
+def _larger_number(a: Any, b: Any) -> Any:
+    """Return the larger of two numbers."""
+    return max(a, b)
 
-    def generate(_: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        x, y = (_widened(builder, *one) for one in zip(signature.args, arguments, strict=True))
-        return builder.select(builder.fcmp_ordered(">", x, y), x, y)
 
-    return LANES(a, b), generate
+_on_pairs(operator.add, lambda builder, x, y: builder.fadd(x, y, flags=_FAST))
+_on_pairs(operator.sub, lambda builder, x, y: builder.fsub(x, y, flags=_FAST))
+_on_pairs(operator.mul, lambda builder, x, y: builder.fmul(x, y, flags=_FAST))
+_on_pairs(operator.truediv, lambda builder, x, y: builder.fdiv(x, y, flags=_FAST))
+_on_pairs(larger, lambda builder, x, y: builder.select(builder.fcmp_ordered(">", x, y), x, y), _larger_number)
 
 
 @intrinsic
@@ -110,24 +97,6 @@ def _root(_: Any, a: Any) -> Any:
         return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.sqrt.v{COUNT}f32"), arguments)
 
     return LANES(a), generate
-
-
-def larger(a: Any, b: Any) -> Any:
-    """Return the larger of two values element by element; values may be Lanes or float32."""
-    return np.maximum(a, b)
-
-
-@overload(larger)
-def _larger_chosen(a: Any, b: Any) -> Any:
-    """Return the implementation of `larger` for Lanes or for numbers."""
-
-    def of_lanes(a: Any, b: Any) -> Any:
-        return _larger(a, b)
-
-    def of_numbers(a: Any, b: Any) -> Any:
-        return max(a, b)
-
-    return of_lanes if _is_pair(a, b) else of_numbers
 
 
 def root(a: Any) -> Any:
@@ -247,17 +216,21 @@ def fetch(_: Any, array: Any, starts: Any, offset: Any) -> Any:
 
 
 @intrinsic
-def store(_: Any, array: Any, place: Any, lanes: Any, count: Any) -> Any:
-    """Write the first `count` Lanes to a float32 array (n,) from a place on; at most `COUNT` are written."""
+def scatter(_: Any, array: Any, starts: Any, offset: Any, lanes: Any, count: Any) -> Any:
+    """Write the first `count` values of each Lanes of a tuple to a float32 array (n,) from its start + offset on.
+
+    At most `COUNT` are written.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        to = _at(context, builder, signature.args[0], *arguments[:2])
         places = ir.Constant(ir.VectorType(_WHOLE, COUNT), list(range(COUNT)))
-        written = builder.icmp_signed("<", places, _everywhere(builder, builder.trunc(arguments[3], _WHOLE)))
-        kind = ir.FunctionType(ir.VoidType(), [_VECTOR, to.type, _WHOLE, written.type])
+        written = builder.icmp_signed("<", places, _everywhere(builder, builder.trunc(arguments[4], _WHOLE)))
+        kind = ir.FunctionType(ir.VoidType(), [_VECTOR, _VECTOR.as_pointer(), _WHOLE, written.type])
         name = f"llvm.masked.store.v{COUNT}f32.p0v{COUNT}f32"
         masked = cgutils.get_or_insert_function(builder.module, kind, name)
-        builder.call(masked, [arguments[2], to, _WHOLE(4), written])
+        runs = _runs(context, builder, signature, arguments)
+        for run, vector in zip(runs, cgutils.unpack_tuple(builder, arguments[3]), strict=True):
+            builder.call(masked, [vector, run, _WHOLE(4), written])
         return context.get_dummy_value()
 
-    return types.void(array, types.intp, lanes, types.intp), generate
+    return types.void(array, starts, types.intp, lanes, types.intp), generate

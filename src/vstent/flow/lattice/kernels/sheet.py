@@ -15,16 +15,13 @@ COLUMNS: Final = 7
 def spread(index: Any, frame: Any, sheet: Any, number: Any, found: Any, sums: Any) -> int:
     """Share the samples of a sheet among the eight cells around each; return how many cells receive something.
 
-    Parameters
-    ----------
-    index : (i, j, k); cell number at every grid point, -1 outside.
-    frame : (4,); position of grid point 0, 0, 0, and the grid spacing.
-    sheet : tuple; samples (p, 3); unit normals (p, 3); per sample (p,) the area per volume of a cell, the resistance
-        along the normal and across it, and the inertial loss.
-    number : (cells,); filled with -1; set to the row of every cell that receives something.
-    found : (cells,); set to the cell of every row.
-    sums : (cells, `COLUMNS`); filled with zeros. The sums over the samples of every row, per volume: normal (3),
-        resistance along and across it, square of the latter times `_twice`, inertial loss.
+    `index` (i, j, k) holds the number of the cell at every grid point, -1 outside; `frame` (4,) the position of grid
+    point 0, 0, 0 and the grid spacing; `sheet` the samples (p, 3), unit normals (p, 3) and per sample (p,) the area per
+    volume of a cell, the resistances along the normal and across it, and the inertial loss.
+
+    `number` (cells,), filled with -1, is set to the row of every cell that receives something, `found` (cells,) to the
+    cell of every row, and `sums` (cells, `COLUMNS`), filled with zeros, to the sums over the samples of every row, per
+    volume: normal (3), resistance along and across it, square of the latter times `_twice`, inertial loss.
     """
     points, normals, area, along, across, loss = sheet
     cells, weights, height = np.zeros(8, np.int32), np.zeros(8), np.zeros(8)
