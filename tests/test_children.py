@@ -13,7 +13,7 @@ from vstent.children import environment
 from vstent.flow.lattice.kernels import warm
 from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_stl
-from vstent.kernels.first_use import kept
+from vstent.kernels.first_use import ensure_cached
 from vstent.plan.workers import spread
 from vstent.study.workers import Processes
 
@@ -47,7 +47,7 @@ def test_the_trap_works(trap, tmp_path):
 def test_files_are_read_and_kernels_compiled_in_a_folder_of_namesakes(trap, tmp_path):
     write_stl(tmp_path / "a.stl", artery())
     assert len(read_surface(tmp_path / "a.stl", units="mm")[0].faces) == len(artery().faces)
-    kept(lambda: None, (sys.executable, "-c", "import random, vstent.cli"))
+    ensure_cached(lambda: None, (sys.executable, "-c", "import random, vstent.cli"))
 
 
 def test_workers_start_in_a_folder_of_namesakes(trap):

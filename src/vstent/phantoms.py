@@ -19,7 +19,6 @@ from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Centerline
 from vstent.kernels import curves, smoothing, triangles
 from vstent.kernels.arrays import Floats, freeze
-from vstent.kernels.clipping import clip
 from vstent.kernels.isosurface import isosurface
 
 AXIS_STEP_MM: Final = 0.04
@@ -315,7 +314,7 @@ def phantom_surface(phantom: Phantom, *, edge_mm: float = 0.25) -> Surface:
         near = (across < 1.5 * radius) & (height > -radius)
         beyond = np.where(near, np.maximum(beyond, height), beyond)
     beyond[np.abs(beyond) < 1e-6] = 0.0
-    vertices, faces = triangles.compact(*clip(vertices, faces, beyond))
+    vertices, faces = triangles.compact(*triangles.cut(vertices, faces, beyond))
     rim = np.unique(triangles.open_edges(faces))
     vertices[rim] = _onto_wall(phantom, vertices[rim])  # at the end of a round tube they stay in the plane
     return Surface(vertices, faces)

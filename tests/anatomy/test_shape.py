@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from tubes import line, tube
 
-from vstent.anatomy.morphology import morphology
-from vstent.anatomy.shape import beyond_plane, shape_indices
+from vstent.anatomy.morphology import beyond_plane, morphology, shape_indices
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Aneurysm
 

@@ -91,8 +91,14 @@ def test_a_straight_line_neither_bends_nor_twists() -> None:
 
 
 @pytest.mark.parametrize(("n", "window"), [(7, 7), (50, 7), (50, 21), (60, 59)])
-def test_curvature_comes_from_the_derivatives_of_savitzky_and_golay(n: int, window: int) -> None:
+def test_curvature_and_torsion_come_from_the_derivatives_of_savitzky_and_golay(n: int, window: int) -> None:
     points = np.cumsum(np.random.default_rng(n).normal(size=(n, 3)), axis=0)
-    for k, found in enumerate(curves._derivatives(points, window, 0.3), start=1):
-        wanted = savgol_filter(points, window, 4, deriv=k, delta=0.3, axis=0)
-        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-10 * np.abs(wanted).max())
+    step = curves.arc_length(points)[-1] / (n - 1)
+    a, b, c = (savgol_filter(points, window, 4, deriv=k, delta=step, axis=0) for k in (1, 2, 3))
+    cross = np.cross(a, b)
+    size = np.linalg.norm(cross, axis=1)
+    assert size.min() > 1e-6
+    curvature, torsion = curves.curvature_and_torsion(points, window // 2 * step)
+    np.testing.assert_allclose(curvature, size / np.linalg.norm(a, axis=1) ** 3, rtol=1e-9)
+    wanted = np.einsum("ij,ij->i", cross, c) / size**2
+    np.testing.assert_allclose(torsion, wanted, rtol=1e-9, atol=1e-10 * np.abs(wanted).max())

@@ -15,7 +15,7 @@ from vstent.cli import warm
 from vstent.flow.problem import vessel_case
 from vstent.flow.settings import Numerics
 from vstent.kernels import cache
-from vstent.kernels.first_use import kept, telling
+from vstent.kernels.first_use import ensure_cached, reporting_compilation
 
 
 def test_the_first_compilation_is_told_once_and_a_kept_kernel_is_not():
@@ -24,11 +24,11 @@ def test_the_first_compilation_is_told_once_and_a_kept_kernel_is_not():
         return 2 * x
 
     said = []
-    with telling(lambda: said.append("compiling")):
+    with reporting_compilation(lambda: said.append("compiling")):
         double(1)
         double(1.0)
         assert said == ["compiling"]
-    with telling(lambda: said.append("again")):
+    with reporting_compilation(lambda: said.append("again")):
         double(3)
     assert said == ["compiling"]
 
@@ -41,7 +41,7 @@ def test_a_helper_begins_with_the_first_compilation_and_ends_with_the_work(monke
     helper = sys.executable, "-c", "import time; time.sleep(60)"
     started, begin = [], subprocess.Popen
     monkeypatch.setattr(subprocess, "Popen", lambda *a, **k: started.append(begin(*a, **k)) or started[-1])
-    with telling(lambda: None, helper=helper):
+    with reporting_compilation(lambda: None, helper=helper):
         assert started == []
         half(1)
         half(1.0)
@@ -67,12 +67,12 @@ def test_what_is_not_kept_another_process_compiles_and_this_one_takes_from_the_c
         third(2.0)
 
     work = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import kernel_of_a_test as k; k.third(2.0)"
-    kept(call, (sys.executable, "-c", work))
+    ensure_cached(call, (sys.executable, "-c", work))
     assert third.signatures == []
     said = []
-    with telling(lambda: said.append("compiling")):
+    with reporting_compilation(lambda: said.append("compiling")):
         call()
-        kept(call, ("this", "is", "not", "run"))
+        ensure_cached(call, ("this", "is", "not", "run"))
     assert said == []
     assert sum(third.stats.cache_hits.values()) == 1
 
@@ -87,7 +87,7 @@ def test_while_one_thread_takes_kernels_from_the_cache_others_may_compile():
         thread.start()
         thread.join()
 
-    kept(other, ("this", "is", "not", "run"))
+    ensure_cached(other, ("this", "is", "not", "run"))
     assert len(quarter.signatures) == 1
 
 
@@ -118,7 +118,7 @@ def test_the_set_up_compiles_every_kernel_of_a_deployment():
     warm.warm()
     said = []
     artery = tube(line(30), 1.9, around=40)
-    with telling(lambda: said.append("compiling")):
+    with reporting_compilation(lambda: said.append("compiling")):
         design = catalogue.find_design("silk")
         measure(artery, deploy(design, artery, size=catalogue.find_size(design, diameter_mm=4), landing=Landing(15.0)))
     assert said == []
@@ -136,7 +136,7 @@ def test_the_set_up_compiles_what_takes_a_flows_time_so_that_all_processes_run_t
     kernels = d3q19.update, d3q19.defer
     vessel = trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=10.0, radius_mm=2.0), edge_mm=0.5)))
     said = []
-    with telling(lambda: said.append("compiling")):
+    with reporting_compilation(lambda: said.append("compiling")):
         simulate_case(
             vessel_case(vessel, FlowSettings(inflow_mL_s=1.0, numerics=Numerics(cell_size_mm=0.4, max_steps=10)))
         )

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from vstent.geometry.surface import Surface
-from vstent.kernels import triangles, voxels
+from vstent.kernels import voxels
 from vstent.kernels.arrays import Bools, Floats
 
 MOST_VOXELS: Final = 2_000_000
@@ -42,13 +42,10 @@ def similar(sizes: NDArray[Any]) -> list[int]:
 
 
 def bulging(sizes: NDArray[Any], prominence_of: Callable[[int], float]) -> int:
-    """Return the number of the piece to keep: the largest of those with a bulge, or the largest of all.
-
-    Shapes: `sizes` (n,).
-    """
+    """Return the number of the piece to keep: the largest (n,) of those with a bulge, or the largest of all."""
     pieces = similar(sizes)
-    found = (k for k in pieces if len(pieces) > 1 and prominence_of(k) >= BULGING)
-    return next(found, pieces[0])
+    with_bulge = (k for k in pieces if len(pieces) > 1 and prominence_of(k) >= BULGING)
+    return next(with_bulge, pieces[0])
 
 
 def prominence(inside: Bools, spacing_mm: Floats) -> float:
@@ -57,8 +54,6 @@ def prominence(inside: Bools, spacing_mm: Floats) -> float:
     A bulge is an inscribed sphere around which the wall is near on all sides. Its prominence is the ratio of its radius
     to that of the narrowest passage that leads out of it. The sphere of an artery has others of similar radius before
     and behind it.
-
-    Shapes: `inside` (i, j, k), `spacing_mm` (3,).
     """
     stride = max(1, int(np.ceil((inside.size / MOST_VOXELS) ** (1 / 3))))
     inside, spacing_mm = inside[::stride, ::stride, ::stride], spacing_mm * stride
@@ -83,9 +78,7 @@ def prominence(inside: Bools, spacing_mm: Floats) -> float:
 
 def prominence_of_surface(surface: Surface) -> float:
     """Measure the `prominence` of the widest bulge inside a surface, whose loops are closed with flat caps."""
-    vertices, faces = triangles.cap(surface.vertices_mm, surface.faces, surface.boundary_loops)
-    corners_mm = vertices[faces]
-    volume_mm3 = triangles.volume(corners_mm)
+    corners_mm, volume_mm3 = surface.closed.corners_mm, surface.closed.volume_mm3
     extent_mm = np.ptp(corners_mm, axis=(0, 1))
     edge_mm = max(4 * abs(volume_mm3) / surface.area_mm2 / VOXELS_ACROSS, (extent_mm.prod() / MOST_VOXELS) ** (1 / 3))
     low = corners_mm.min(axis=(0, 1)) - edge_mm

@@ -17,7 +17,7 @@ from vstent.anatomy.openings import still_open
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Vessel
 from vstent.kernels import curves, triangles
-from vstent.kernels.arrays import Bools, Floats, Ints
+from vstent.kernels.arrays import Floats
 from vstent.kernels.medial import Medial
 from vstent.units import place
 
@@ -60,6 +60,18 @@ class Artery(NamedTuple):
         along = (offset @ self.direction)[:, None] * self.direction
         return np.asarray(np.linalg.norm(offset - along, axis=1) - self.radius_mm)
 
+    def turns_to(self, across: Floats) -> bool:
+        """Return whether a path with the vector (3,) in the window turns there."""
+        length = float(np.linalg.norm(self.direction) * np.linalg.norm(across))
+        cosine = abs(float(self.direction @ across)) / max(length, 1e-12)
+        return bool(np.arccos(min(cosine, 1.0)) > TURN_RAD)
+
+    def goes_on(self, spheres: Medial) -> bool:
+        """Return whether it continues beyond the point where the path turns off it."""
+        ahead = self.point_mm + AHEAD * self.radius_mm * self.direction
+        near = cKDTree(spheres.points).query_ball_point(ahead, SAME * self.radius_mm)
+        return bool((spheres.radius[near] > SAME * self.radius_mm).any())
+
 
 class Contact(NamedTuple):
     """A window between two arteries."""
@@ -80,40 +92,26 @@ class Contact(NamedTuple):
 
 
 def find_contact(path_mm: Floats, radius_mm: Floats, spheres: Medial) -> Contact | None:
-    """Find the narrowest window between two arteries on a path.
-
-    Shapes: `path_mm` (n, 3), `radius_mm` (n,).
-    """
+    """Return the narrowest window between two arteries on a path (n, 3) with inscribed radii (n,), if there is one."""
     place = curves.arc_length(path_mm)
     even = np.arange(0.0, place[-1], STEP_MM)
     points, radius = curves.interpolate(place, path_mm, even), np.interp(even, place, radius_mm)
     inner = np.arange(1, len(even) - 1)
     waists = inner[(radius[inner] <= radius[inner - 1]) & (radius[inner] < radius[inner + 1])]
-    found = (_contact_at(points, radius, int(i), spheres) for i in waists[np.argsort(radius[waists])])
-    return next((contact for contact in found if contact is not None), None)
-
-
-def _contact_at(points: Floats, radius: Floats, waist: int, spheres: Medial) -> Contact | None:
-    """Return the window at a waist of the path; None for a stenosis, a branch or a communicating artery."""
-    before, after = (_artery(points[waist::sense], radius[waist::sense]) for sense in (-1, 1))
-    if before is None or after is None:
-        return None
-    contact = Contact(points[waist], float(radius[waist]), before, after)
-    half = max(1, round(0.3 * contact.artery_mm / STEP_MM))
-    if contact.radius_mm > WAIST * contact.artery_mm or waist < half or waist + half >= len(points):
-        return None
-    if np.linalg.norm(after.point_mm - before.point_mm) > APART * (before.radius_mm + after.radius_mm):
-        return None
-    across = points[waist + half] - points[waist - half]
-    is_window = all(_angle(side.direction, across) > TURN_RAD and _goes_on(spheres, side) for side in (before, after))
-    return contact if is_window else None
-
-
-def _goes_on(spheres: Medial, artery: Artery) -> bool:
-    """Return whether an artery continues beyond the point where the path turns off it."""
-    ahead = artery.point_mm + AHEAD * artery.radius_mm * artery.direction
-    near = cKDTree(spheres.points).query_ball_point(ahead, SAME * artery.radius_mm)
-    return bool((spheres.radius[near] > SAME * artery.radius_mm).any())
+    for waist in waists[np.argsort(radius[waists])]:
+        before, after = (_artery(points[waist::sense], radius[waist::sense]) for sense in (-1, 1))
+        if before is None or after is None:
+            continue
+        contact = Contact(points[waist], float(radius[waist]), before, after)
+        half = max(1, round(0.3 * contact.artery_mm / STEP_MM))
+        if contact.radius_mm > WAIST * contact.artery_mm or waist < half or waist + half >= len(points):
+            continue
+        if np.linalg.norm(after.point_mm - before.point_mm) > APART * (before.radius_mm + after.radius_mm):
+            continue
+        across = points[waist + half] - points[waist - half]
+        if all(side.turns_to(across) and side.goes_on(spheres) for side in (before, after)):
+            return contact
+    return None
 
 
 def _artery(points: Floats, radius: Floats) -> Artery | None:
@@ -130,76 +128,45 @@ def _artery(points: Floats, radius: Floats) -> Artery | None:
     return Artery(points[here], course / max(float(np.linalg.norm(course)), 1e-9), typical)
 
 
-def _angle(one: Floats, other: Floats) -> float:
-    """Return the angle between two lines along vectors (3,), in rad, from 0 to a right angle."""
-    cosine = abs(float(one @ other)) / max(float(np.linalg.norm(one) * np.linalg.norm(other)), 1e-12)
-    return float(np.arccos(min(cosine, 1.0)))
-
-
 def part(vessel: Vessel, contact: Contact, *, holds_inlet: bool) -> Vessel | None:
     """Separate two arteries by closing the window between them on both sides.
 
-    Parameters
-    ----------
-    vessel : lumen and openings.
-    contact : window between the arteries.
-    holds_inlet : where the vessel falls into two parts, keep the part with the inlet; otherwise keep the larger part.
-
-    Returns leave fewer than two openings, remove an inlet, or remove a part fed through a window that is not small.
+    Where the vessel falls into two parts, the part with the inlet is kept where it `holds_inlet`, otherwise the larger
+    part. None if that would leave fewer than two openings, remove an inlet, or remove a part fed through a window that
+    is not small, or where the faces around the window form no ring.
     """
-    lumen = vessel.lumen
-    ring = _ring(lumen, contact)
-    if ring is None:
-        return None
-    rest = lumen.faces[~ring]
-    at_cut = np.zeros(len(lumen.vertices_mm), dtype=bool)
-    at_cut[lumen.faces[ring]] = True
-    lids = [loop for loop in triangles.boundary_loops(lumen.vertices_mm, rest) if at_cut[loop].all()]
-    if len(lids) != 2:
-        return None
-    vertices, faces = triangles.cap(lumen.vertices_mm, rest, lids)
-    kept = _kept(vertices, faces, vessel.inlet.center_mm if holds_inlet else None)
-    whole = replace(vessel, lumen=Surface(*triangles.compact(vertices, faces[kept])))
-    share = float(1 - triangles.areas(vertices[faces[kept]]).sum() / triangles.areas(vertices[faces]).sum())
-    parted = still_open(replace(whole, notes=(*vessel.notes, _note(contact, share))))
-    if parted is None or len(parted.inlets) < len(vessel.inlets):
-        return None
-    if kept.all() or contact.radius_mm < SMALL * contact.artery_mm:
-        return parted
-    return parted if len(vessel.openings) - len(parted.openings) >= 2 else None
-
-
-def _ring(lumen: Surface, contact: Contact) -> Bools | None:
-    """Return whether each face (m,) is in the crevice around the window; None where these faces form no ring."""
-    points = lumen.vertices_mm
-    nearer = contact.before.height_mm(points) > contact.after.height_mm(points)
-    is_after = nearer[lumen.faces]
+    points, lumen = vessel.lumen.vertices_mm, vessel.lumen
+    is_after = (contact.before.height_mm(points) > contact.after.height_mm(points))[lumen.faces]
     cut = np.flatnonzero(is_after.any(axis=1) & ~is_after.all(axis=1))
     if not len(cut):
         return None
-    faces = lumen.faces[cut]
     distance = np.linalg.norm(lumen.corners_mm[cut].mean(axis=1) - contact.center_mm, axis=1)
-    label = triangles.components(faces, len(points))
+    label = triangles.components(lumen.faces[cut], len(points))
     mine = label == label[distance.argmin()]
     if distance[mine].max() > REACH * contact.artery_mm:
         return None
-    ring = np.zeros(len(lumen.faces), dtype=bool)
-    ring[cut[mine]] = True
-    return ring
-
-
-def _kept(vertices: Floats, faces: Ints, inlet_mm: Floats | None) -> Bools:
-    """Return whether each face (m,) is in the part at the inlet (3,), or in the part of largest area."""
-    label = triangles.components(faces, len(vertices))
-    if inlet_mm is not None:
-        return np.asarray(label == label[np.linalg.norm(vertices[faces].mean(axis=1) - inlet_mm, axis=1).argmin()])
-    return np.asarray(label == np.bincount(label, triangles.areas(vertices[faces])).argmax())
-
-
-def _note(contact: Contact, lost: float) -> str:
-    """Return the note on two separated arteries."""
-    left = f"; the part connected only through it ({lost:.0%} of the wall) was removed" if lost > 0 else ""
-    return (
+    rest = np.delete(lumen.faces, cut[mine], axis=0)
+    at_cut = np.zeros(len(points), dtype=bool)
+    at_cut[lumen.faces[cut[mine]]] = True
+    lids = [loop for loop in triangles.boundary_loops(points, rest) if at_cut[loop].all()]
+    if len(lids) != 2:
+        return None
+    vertices, faces = triangles.cap(points, rest, lids)
+    area, label = triangles.areas(vertices[faces]), triangles.components(faces, len(vertices))
+    if holds_inlet:
+        to_inlet = np.linalg.norm(vertices[faces].mean(axis=1) - vessel.inlet.center_mm, axis=1)
+        kept = label == label[to_inlet.argmin()]
+    else:
+        kept = label == np.bincount(label, area).argmax()
+    share = float(1 - area[kept].sum() / area.sum())
+    left = f"; the part connected only through it ({share:.0%} of the wall) was removed" if share > 0 else ""
+    note = (
         f"Two touching arteries were separated at {place(contact.center_mm)} (window of "
         f"{2 * contact.radius_mm:.2f} mm){left}."
     )
+    whole = Surface(*triangles.compact(vertices, faces[kept]))
+    parted = still_open(replace(vessel, lumen=whole, notes=(*vessel.notes, note)))
+    if parted is None or len(parted.inlets) < len(vessel.inlets):
+        return None
+    is_small = kept.all() or contact.radius_mm < SMALL * contact.artery_mm
+    return parted if is_small or len(vessel.openings) - len(parted.openings) >= 2 else None

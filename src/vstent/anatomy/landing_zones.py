@@ -13,16 +13,7 @@ ZONE_MM: Final = 5.0
 
 
 def neck_span_mm(anatomy: Anatomy) -> tuple[float, float]:
-    """Return where the largest aneurysm's neck begins and ends on the parent axis, in mm.
-
-    Parameters
-    ----------
-    anatomy : restored parent artery.
-
-    Returns
-    -------
-    proximal_mm, distal_mm : abscissae in mm; both are the middle of the axis without an aneurysm.
-    """
+    """Return where the largest aneurysm's neck begins and ends on the parent axis; the middle of it without one."""
     if anatomy.aneurysms:
         return anatomy.parent.span_mm(anatomy.aneurysms[0])
     middle_mm = 0.5 * anatomy.parent.axis.length_mm
@@ -30,12 +21,7 @@ def neck_span_mm(anatomy: Anatomy) -> tuple[float, float]:
 
 
 def neck_points_mm(anatomy: Anatomy) -> Floats:
-    """Return the vertices (n, 3) of the largest aneurysm's neck in mm; empty without an aneurysm.
-
-    Parameters
-    ----------
-    anatomy : restored parent artery.
-    """
+    """Return the vertices (n, 3) of the largest aneurysm's neck in mm; empty without an aneurysm."""
     if not anatomy.aneurysms:
         return np.zeros((0, 3))
     neck = anatomy.aneurysms[0].neck
@@ -43,12 +29,7 @@ def neck_points_mm(anatomy: Anatomy) -> Floats:
 
 
 def landing_diameters_mm(anatomy: Anatomy) -> tuple[float, float]:
-    """Return the mean diameters of the parent artery in the landing zones beside the neck.
-
-    Parameters
-    ----------
-    anatomy : restored parent artery.
-    """
+    """Return the mean diameters of the parent artery in the landing zones before and after the neck, in mm."""
     proximal_mm, distal_mm = neck_span_mm(anatomy)
     first_mm, last_mm = anatomy.parent.own_mm
     before = np.linspace(max(first_mm, proximal_mm - ZONE_MM), max(first_mm, proximal_mm), 51)

@@ -1,13 +1,13 @@
 """Measure the aneurysm: sac, neck and parent artery in numbers."""
 
 from dataclasses import replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.spatial.distance import pdist
 
 from vstent.anatomy.landing_zones import landing_diameters_mm, neck_span_mm
-from vstent.anatomy.shape import beyond_plane, shape_indices
+from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy, Aneurysm, Centerline
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Floats
@@ -26,6 +26,15 @@ LEAST_UPSTREAM: Final = 0.25
 BENT: Final = 0.1
 """An axis is bent, and has a torsion, where its curvature exceeds this value divided by the artery's diameter."""
 
+ON_NECK_MM: Final = 1e-4
+"""Distance from the neck, in mm, below which a face of the sac belongs to it: both have the same triangles."""
+ON_PLANE_MM: Final = 1e-6
+"""A neck within this distance of a plane, in mm, lies in it: the whole sac is beyond."""
+ON_PLANE: Final = 1e-6
+"""Largest deviation from 1 of the cosine between the neck plane's normal and that of a facet on the plane."""
+HALF_SPHERE: Final = float(np.cbrt(18 * np.pi))
+"""Wall area of a half sphere over its volume to the power 2/3."""
+
 
 def morphology(anatomy: Anatomy) -> Morphology:
     """Measure the parent artery and its aneurysms.
@@ -41,7 +50,7 @@ def morphology(anatomy: Anatomy) -> Morphology:
     that separate the sac nearly as well. A neck drawn by hand has the mean plane of its curve. There the area of the
     section is left out where the artery's wall rises through the plane and divides it.
 
-    The shape indices of Raghavan et al. 2005 are those of the sac beyond the neck plane (`vstent.anatomy.shape`). The
+    The shape indices of Raghavan et al. 2005 are those of the sac beyond the neck plane (see `shape_indices`). The
     inflow angle (Baharoglu et al. 2010) lies between the parent axis over one diameter before the neck and the line
     from the center of the neck to the farthest point of the dome. It is 90 degrees for a sac beside a straight artery,
     and 180 degrees for one straight ahead of the flow.
@@ -112,16 +121,21 @@ def _sac(aneurysm: Aneurysm, axis: Centerline, parent_diameter_mm: float) -> Mea
     plane, dome_mm = aneurysm.plane or aneurysm.mean_plane, aneurysm.sac.vertices_mm
     center_mm, normal = plane.center_mm, plane.normal
     height_mm = float(((dome_mm - center_mm) @ normal).max())
-    reach_mm = float(np.linalg.norm(dome_mm - center_mm, axis=1).max())
+    reaches_mm = np.linalg.norm(dome_mm - center_mm, axis=1)
+    reach_mm = float(reaches_mm.max())
     neck_mean_mm = float(2 * np.linalg.norm(plane.rim_mm - center_mm, axis=1).mean())
-    width_mm = _widths_mm(plane.rim_mm, normal)
+    outermost = np.unique((dome_mm @ curves.directions(600).T).argmax(axis=0))
+    first = curves.any_perpendicular(normal)
+    angle = np.pi * np.arange(180) / 180
+    across = np.outer(first, np.cos(angle)) + np.outer(np.cross(normal, first), np.sin(angle))
+    width_mm = np.ptp(plane.rim_mm @ across, axis=0)
     beyond = beyond_plane(aneurysm, center_mm, normal)
-    found: Measures = {
+    measures: Measures = {
         "sac_volume_mm3": abs(aneurysm.sac.volume_mm3),
         "sac_area_mm2": aneurysm.sac.area_mm2 - aneurysm.neck.area_mm2,
         "sac_height_mm": height_mm,
         "sac_max_height_mm": reach_mm,
-        "sac_max_diameter_mm": _diameter_mm(dome_mm),
+        "sac_max_diameter_mm": float(pdist(dome_mm[outermost]).max()),
         "sac_plane_volume_mm3": beyond.volume_mm3,
         "neck_area_mm2": float(np.linalg.norm(triangles.polygon_area_vector(aneurysm.neck_mm))),
         "neck_surface_area_mm2": aneurysm.neck.area_mm2,
@@ -131,42 +145,75 @@ def _sac(aneurysm: Aneurysm, axis: Centerline, parent_diameter_mm: float) -> Mea
         "aspect_ratio": height_mm / neck_mean_mm,
         "size_ratio": reach_mm / parent_diameter_mm,
         **shape_indices(beyond, normal),
-        **_inflow_angle(aneurysm, axis, center_mm, parent_diameter_mm),
     }
+    neck_mm = float(np.clip(axis.nearest_abscissa_mm(aneurysm.neck_mm).min(), 0.0, axis.length_mm))
+    if neck_mm >= LEAST_UPSTREAM * parent_diameter_mm:
+        before_mm, here_mm = axis.at(np.array([max(neck_mm - parent_diameter_mm, 0.0), neck_mm]))
+        longest_mm, upstream_mm = dome_mm[reaches_mm.argmax()] - center_mm, before_mm - here_mm
+        cosine = longest_mm @ upstream_mm / np.linalg.norm(longest_mm) / np.linalg.norm(upstream_mm)
+        measures["inflow_angle_rad"] = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
     if aneurysm.plane is not None:
         low_mm2, high_mm2 = plane.area_band_mm2
-        found |= {"neck_plane_area_mm2": plane.area_mm2}
-        found |= {"neck_plane_area_low_mm2": low_mm2, "neck_plane_area_high_mm2": high_mm2}
+        measures |= {"neck_plane_area_mm2": plane.area_mm2}
+        measures |= {"neck_plane_area_low_mm2": low_mm2, "neck_plane_area_high_mm2": high_mm2}
     elif beyond.section_mm2 > PARTED * plane.area_mm2:
-        found["neck_plane_area_mm2"] = beyond.section_mm2
-    return found
+        measures["neck_plane_area_mm2"] = beyond.section_mm2
+    return measures
 
 
-def _inflow_angle(
-    aneurysm: Aneurysm, axis: Centerline, center_mm: Floats, parent_diameter_mm: float
-) -> dict[str, float]:
-    """Return the angle between the artery upstream and the longest height of the sac; empty without artery upstream."""
-    neck_mm = float(np.clip(axis.nearest_abscissa_mm(aneurysm.neck_mm).min(), 0.0, axis.length_mm))
-    before_mm, here_mm = axis.at(np.array([max(neck_mm - parent_diameter_mm, 0.0), neck_mm]))
-    if neck_mm < LEAST_UPSTREAM * parent_diameter_mm:
+class Beyond(NamedTuple):
+    """The part of a sac beyond its neck plane."""
+
+    section_mm2: float
+    """Area of the largest piece of the section by the plane, in mm2."""
+    volume_mm3: float
+    """Volume, in mm3."""
+    wall_mm2: float
+    """Area of the wall without the section and without the neck, in mm2."""
+    points_mm: Floats
+    """(n, 3) points of the wall, those on the plane included, in mm."""
+
+
+def beyond_plane(aneurysm: Aneurysm, center_mm: Floats, normal: Floats) -> Beyond:
+    """Cut a sac by a plane, with center and normal (3,), and measure the part beyond."""
+    sac = aneurysm.sac
+    if np.abs((aneurysm.neck.corners_mm - center_mm) @ normal).max() < ON_PLANE_MM:
+        neck_mm2 = aneurysm.neck.area_mm2
+        return Beyond(neck_mm2, sac.volume_mm3, sac.area_mm2 - neck_mm2, sac.vertices_mm)
+    below_mm = -(sac.vertices_mm - center_mm) @ normal
+    vertices, faces, _ = triangles.clip(sac.vertices_mm, sac.faces, below_mm)
+    loops = triangles.boundary_loops(vertices, faces)
+    capped, closed = triangles.cap(vertices, faces, loops)
+    sections = [float(np.linalg.norm(triangles.polygon_area_vector(vertices[loop]))) for loop in loops]
+    is_wall = aneurysm.neck.closest(vertices[faces].mean(axis=1))[1] > ON_NECK_MM
+    wall_mm2 = Surface(vertices, faces[is_wall]).area_mm2
+    points_mm = vertices[np.unique(faces)]
+    return Beyond(max(sections, default=0.0), triangles.volume(capped[closed]), wall_mm2, points_mm)
+
+
+def shape_indices(beyond: Beyond, normal: Floats) -> dict[str, float]:
+    """Compute the shape indices of Raghavan, Ma and Harbaugh 2005.
+
+    With volume V and wall area S of the sac beyond the neck plane, and those of its convex hull, V_h and S_h:
+
+    - undulation index 1 - V / V_h,
+    - ellipticity index 1 - (18 pi)^(1/3) V_h^(2/3) / S_h,
+    - nonsphericity index 1 - (18 pi)^(1/3) V^(2/3) / S.
+
+    The areas are without the neck plane, whose unit normal (3,) points toward the dome. All three are 0 for a half
+    sphere. Empty if no wall lies beyond the plane.
+    """
+    from scipy.spatial import ConvexHull
+
+    if beyond.wall_mm2 == 0:
         return {}
-    dome_mm = aneurysm.sac.vertices_mm - center_mm
-    height_mm = dome_mm[np.linalg.norm(dome_mm, axis=1).argmax()]
-    upstream_mm = before_mm - here_mm
-    cosine = height_mm @ upstream_mm / np.linalg.norm(height_mm) / np.linalg.norm(upstream_mm)
-    return {"inflow_angle_rad": float(np.arccos(np.clip(cosine, -1.0, 1.0)))}
-
-
-def _diameter_mm(points_mm: Floats) -> float:
-    """Return the largest distance between points (n, 3) that are outermost in one of 600 directions."""
-    outermost = np.unique((points_mm @ curves.directions(600).T).argmax(axis=0))
-    return float(pdist(points_mm[outermost]).max())
-
-
-def _widths_mm(rim_mm: Floats, normal: Floats) -> Floats:
-    """Return the widths (180,) of a closed curve in the plane perpendicular to `normal`, one per degree."""
-    first = curves.any_perpendicular(normal)
-    second = np.cross(normal, first)
-    angle = np.pi * np.arange(180) / 180
-    along = rim_mm @ (np.outer(first, np.cos(angle)) + np.outer(second, np.sin(angle)))
-    return np.ptp(along, axis=0)
+    hull = ConvexHull(beyond.points_mm)
+    corners = beyond.points_mm[hull.simplices]
+    is_dome = hull.equations[:, :3] @ normal > ON_PLANE - 1
+    crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[is_dome]
+    hull_mm2 = 0.5 * float(np.linalg.norm(crosses, axis=1).sum())
+    return {
+        "undulation_index": 1 - beyond.volume_mm3 / float(hull.volume),
+        "ellipticity_index": 1 - HALF_SPHERE * float(hull.volume) ** (2 / 3) / hull_mm2,
+        "nonsphericity_index": 1 - HALF_SPHERE * beyond.volume_mm3 ** (2 / 3) / beyond.wall_mm2,
+    }

@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 from vstent.errors import InputError, VesselError
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Opening, Vessel, roles
-from vstent.kernels import curves, medial, triangles
-from vstent.kernels.arrays import Bools, Floats, Ints
+from vstent.kernels import curves, medial, topology, triangles
+from vstent.kernels.arrays import Floats, Ints
 from vstent.units import counted, place
 
 CAP_ANGLE_RAD: Final = np.radians(6.0)
@@ -52,14 +52,9 @@ NEARLY: Final = 0.8
 
 
 def open_ends(vessel: Vessel) -> tuple[Vessel, medial.Medial]:
-    """Cut open and list the ends of a vessel.
+    """Cut open and list the ends of a vessel; raise a VesselError if it has fewer than two.
 
     The widest end is the inlet. The outlets are numbered from the widest to the narrowest.
-
-    Raises
-    ------
-    VesselError
-        When fewer than two ends are found.
     """
     lumen, n_caps = _without_caps(vessel.lumen)
     notes = [f"{counted(n_caps, 'flat cap')} removed to open the vessel."] if n_caps else []
@@ -84,62 +79,38 @@ def open_ends(vessel: Vessel) -> tuple[Vessel, medial.Medial]:
             "piece; in a scan it may be bone: choose a point in the artery (--at), or crop the scan where the "
             "two touch"
         )
-    found = [_opening(lumen.vertices_mm[loop]) for loop in loops]
-    widest = max(found, key=lambda opening: opening.area_mm2)
-    openings = named([widest], found)
+    ends = []
+    for loop in loops:
+        # A loop follows the orientation of its faces, so it is clockwise seen from outside the opening.
+        vector = -triangles.polygon_area_vector(lumen.vertices_mm[loop])
+        area = float(np.linalg.norm(vector))
+        center = triangles.polygon_centroid(lumen.vertices_mm[loop])
+        ends.append(Opening(center, vector / max(area, 1e-300), area, "outlet"))
+    openings = named([max(ends, key=lambda opening: opening.area_mm2)], ends)
     return replace(vessel, lumen=lumen, openings=openings, centerlines=(), notes=(*vessel.notes, *notes)), spheres
 
 
 def opening_at(vessel: Vessel, point_mm: Floats) -> Opening:
-    """Return the opening nearest to a point beside it or in the lumen.
+    """Return the opening nearest to a point (3,) beside it or in the lumen.
 
-    Parameters
-    ----------
-    vessel : vessel with openings.
-    point_mm : (3,) point in mm.
-
-    Raises
-    ------
-    InputError
-        When the point is outside the lumen and farther than 5 mm and two diameters from the nearest opening.
+    An InputError is raised for a point outside the lumen and farther than 5 mm and two diameters from all openings.
     """
-    nearest = min(vessel.openings, key=lambda opening: _away_mm(opening, point_mm))
+    nearest = min(vessel.openings, key=lambda opening: opening.away_mm(point_mm))
     if _is_far(nearest, point_mm) and vessel.lumen.closed.signed_distance(point_mm[None])[0] > 0:
         raise InputError(
             f"no opening of the vessel is near {place(point_mm)}; the nearest, {nearest.described}, is "
-            f"{_away_mm(nearest, point_mm):.0f} mm away: give a point near an opening, in LPS mm"
+            f"{nearest.away_mm(point_mm):.0f} mm away: give a point near an opening, in LPS mm"
         )
     return nearest
 
 
 def with_inlets(vessel: Vessel, inlets_mm: Floats) -> Vessel:
-    """Return the vessel with the openings at given points as its inlets, with a note on each distant point.
+    """Return the vessel with the openings at given points (k, 3) as its inlets, with a note on each distant point.
 
-    Shapes: `inlets_mm` (k, 3).
-
-    Raises
-    ------
-    InputError
-        When a point is near no opening, two points are near the same one, or no opening is left as an outlet.
+    An InputError is raised when a point is near no opening, two points are near the same one, or no opening is left as
+    an outlet.
     """
     inlets = [opening_at(vessel, inlet_mm) for inlet_mm in inlets_mm]
-    _refuse_twice(inlets, inlets_mm)
-    if len(inlets) == len(vessel.openings):
-        raise InputError(
-            f"all {len(inlets)} openings of the vessel are inlets and none is an outlet: remove the inlet "
-            f"{inlets[-1].described}, or another one"
-        )
-    notes = (
-        f"The inlet, {inlet.described}, is {_away_mm(inlet, inlet_mm):.0f} mm from the given point."
-        for inlet, inlet_mm in zip(inlets, inlets_mm, strict=True)
-        if _is_far(inlet, inlet_mm)
-    )
-    openings = named(inlets, vessel.openings)
-    return replace(vessel, openings=openings, centerlines=(), notes=(*vessel.notes, *notes))
-
-
-def _refuse_twice(inlets: Sequence[Opening], inlets_mm: Floats) -> None:
-    """Raise an InputError where two of the points (k, 3) have the same nearest opening."""
     for k, inlet in enumerate(inlets):
         first = inlets.index(inlet)
         if first < k:
@@ -147,6 +118,18 @@ def _refuse_twice(inlets: Sequence[Opening], inlets_mm: Floats) -> None:
                 f"two inlets are the same opening, {inlet.described}, which is the nearest to "
                 f"{place(inlets_mm[first])} and {place(inlets_mm[k])}: give one point near each inlet"
             )
+    if len(inlets) == len(vessel.openings):
+        raise InputError(
+            f"all {len(inlets)} openings of the vessel are inlets and none is an outlet: remove the inlet "
+            f"{inlets[-1].described}, or another one"
+        )
+    notes = (
+        f"The inlet, {inlet.described}, is {inlet.away_mm(inlet_mm):.0f} mm from the given point."
+        for inlet, inlet_mm in zip(inlets, inlets_mm, strict=True)
+        if _is_far(inlet, inlet_mm)
+    )
+    openings = named(inlets, vessel.openings)
+    return replace(vessel, openings=openings, centerlines=(), notes=(*vessel.notes, *notes))
 
 
 def guessed(vessel: Vessel) -> Vessel:
@@ -163,18 +146,13 @@ def guessed(vessel: Vessel) -> Vessel:
     return replace(vessel, notes=(*vessel.notes, note))
 
 
-def _away_mm(opening: Opening, point_mm: Floats) -> float:
-    """Return the distance of a point (3,) from the center of an opening, in mm."""
-    return float(np.linalg.norm(opening.center_mm - point_mm))
-
-
 def _is_far(opening: Opening, point_mm: Floats) -> bool:
     """Return whether a point (3,) is too far from an opening to belong to it."""
-    return _away_mm(opening, point_mm) > max(FARTHEST_MM, FARTHEST_DIAMETERS * opening.diameter_mm)
+    return opening.away_mm(point_mm) > max(FARTHEST_MM, FARTHEST_DIAMETERS * opening.diameter_mm)
 
 
 def still_open(vessel: Vessel) -> Vessel | None:
-    """Return the vessel with those of its openings that its lumen still has.
+    """Return the vessel with those of its openings that its lumen still has; None if no inlet and outlet are left.
 
     If all inlets are gone, the widest remaining opening is the inlet.
     """
@@ -186,22 +164,8 @@ def still_open(vessel: Vessel) -> Vessel | None:
     return replace(vessel, openings=named(inlets, left), centerlines=())
 
 
-def _opening(loop_mm: Floats) -> Opening:
-    """Return the opening at a boundary loop (n, 3)."""
-    # A loop follows the orientation of its faces, so it is clockwise seen from outside the opening.
-    vector = -triangles.polygon_area_vector(loop_mm)
-    area = float(np.linalg.norm(vector))
-    return Opening(triangles.polygon_centroid(loop_mm), vector / max(area, 1e-300), area, "outlet")
-
-
 def named(inlets: Sequence[Opening], openings: Sequence[Opening]) -> tuple[Opening, ...]:
-    """Return the openings with their roles.
-
-    Parameters
-    ----------
-    inlets : openings through which blood enters, in the order of their roles.
-    openings : all openings; the outlets among them are sorted from the widest to the narrowest.
-    """
+    """Return the openings with their roles: inlets in the order given, and the others as outlets, the widest first."""
     outlets = sorted((o for o in openings if o not in inlets), key=lambda opening: -opening.area_mm2)
     in_order = zip([*inlets, *outlets], roles(len(inlets), len(outlets)), strict=True)
     return tuple(replace(opening, role=role) for opening, role in in_order)
@@ -209,7 +173,7 @@ def named(inlets: Sequence[Opening], openings: Sequence[Opening]) -> tuple[Openi
 
 def _without_caps(lumen: Surface) -> tuple[Surface, int]:
     """Return the surface without its flat caps (round coplanar patches with a sharp rim), and the number of caps."""
-    pairs = triangles.face_neighbours(lumen.faces)
+    pairs = topology.face_neighbours(lumen.faces)
     turn = np.arccos(np.clip(np.einsum("ij,ij->i", lumen.normals[pairs[:, 0]], lumen.normals[pairs[:, 1]]), -1, 1))
     label = triangles.joined(pairs[turn < CAP_ANGLE_RAD], len(lumen.faces))
     n_patches = int(label.max()) + 1
@@ -217,42 +181,33 @@ def _without_caps(lumen: Surface) -> tuple[Surface, int]:
     rim = label[pairs[:, 0]] != label[pairs[:, 1]]
     edges = np.bincount(label[pairs[rim]].ravel(), minlength=n_patches)
     sharp = np.bincount(label[pairs[rim & (turn > CAP_RIM_RAD)]].ravel(), minlength=n_patches)
-    candidates = np.flatnonzero((area > CAP_AREA_MM2) & (edges >= FEWEST_RIM_EDGES) & (sharp > 0.8 * edges))
-    discs = [patch for patch in candidates if _is_disc(lumen, label == patch)]
     is_cap = np.zeros(n_patches, dtype=bool)
-    is_cap[[k for k in discs if edges[k] >= CAP_RIM_EDGES or _is_across_lumen(lumen, label == k)]] = True
+    for patch in np.flatnonzero((area > CAP_AREA_MM2) & (edges >= FEWEST_RIM_EDGES) & (sharp > 0.8 * edges)):
+        member = label == patch
+        weight = lumen.areas_mm2[member]
+        total = weight.sum()
+        mean = weight @ lumen.normals[member] / total
+        outline = lumen.vertices_mm[triangles.open_edges(lumen.faces[member])]
+        perimeter = np.linalg.norm(np.diff(outline, axis=1), axis=2).sum()
+        if np.linalg.norm(mean) <= np.cos(CAP_ANGLE_RAD) or 4 * np.pi * total <= 0.6 * perimeter**2:
+            continue
+        # Where the lumen two patch radii behind it is as narrow as the patch, a cap may have few edges.
+        radius = float(np.sqrt(total / np.pi))
+        behind = weight @ lumen.corners_mm[member].mean(axis=1) / total - 2.0 * radius * mean
+        is_cap[patch] = edges[patch] >= CAP_RIM_EDGES or lumen.closest(behind[None])[1][0] < 1.5 * radius
     if not is_cap.any():
         return lumen, 0
     vertices, faces = triangles.compact(lumen.vertices_mm, lumen.faces[~is_cap[label]])
     return Surface(vertices, faces), int(is_cap.sum())
 
 
-def _is_disc(lumen: Surface, member: Bools) -> bool:
-    """Return whether the faces lie in a plane and have a nearly round outline."""
-    weight = lumen.areas_mm2[member]
-    mean = weight @ lumen.normals[member] / weight.sum()
-    edges = triangles.open_edges(lumen.faces[member])
-    perimeter = np.linalg.norm(np.diff(lumen.vertices_mm[edges], axis=1), axis=2).sum()
-    return bool(np.linalg.norm(mean) > np.cos(CAP_ANGLE_RAD) and 4 * np.pi * weight.sum() > 0.6 * perimeter**2)
-
-
-def _is_across_lumen(lumen: Surface, member: Bools) -> bool:
-    """Return whether the lumen two patch radii behind a flat patch is as narrow as the patch."""
-    weight = lumen.areas_mm2[member]
-    radius = float(np.sqrt(weight.sum() / np.pi))
-    center = weight @ lumen.corners_mm[member].mean(axis=1) / weight.sum()
-    behind = center - 2.0 * radius * (weight @ lumen.normals[member] / weight.sum())
-    return bool(lumen.closest(behind[None])[1][0] < 1.5 * radius)
-
-
 def _with_open_arms(lumen: Surface, slenderness: float) -> tuple[Surface, int]:
     """Return the surface with its long blind arms cut open, and the number of these arms."""
     graph = lumen.medial
     roots = np.asarray(cKDTree(graph.points).query(lumen.loop_centers_mm)[1], dtype=np.int32)
-    paths = medial.arms(graph, roots, slenderness, ARM_RADIUS_MM)
-    blind = [path for path in paths if _is_blind(graph, path)]
     n_cut = 0
-    for cut in [_cut_of(graph.points[path], graph.radius[path], slenderness) for path in blind]:
+    for path in medial.arms(graph, roots, slenderness, ARM_RADIUS_MM):
+        cut = _blind_end(graph, path, slenderness)
         opened = None if cut is None else cut_square(lumen, *cut, ARM_SHARE)
         # A cut must add one end. A cut that also removes an end has reached another artery.
         if opened is not None and len(opened.boundary_loops) > len(lumen.boundary_loops):
@@ -260,23 +215,21 @@ def _with_open_arms(lumen: Surface, slenderness: float) -> tuple[Surface, int]:
     return (Surface(*triangles.largest_part(lumen.vertices_mm, lumen.faces)) if n_cut else lumen), n_cut
 
 
-def _is_blind(graph: medial.Medial, path: Ints) -> bool:
-    """Return whether the tip of an arm is reached only along its path (k,), and not also through a loop of arteries."""
+def _blind_end(graph: medial.Medial, path: Ints, slenderness: float) -> tuple[Floats, Floats, float] | None:
+    """Return center and direction of the cut that opens an arm (path to its tip), and its radius.
+
+    None for a sac, and for an arm whose tip is also reached in another way, through a loop of arteries.
+    """
+    points_mm, radius_mm = graph.points[path], graph.radius[path]
+    abscissa, typical = curves.arc_length(points_mm), float(np.median(radius_mm))
     # Connections less than half as wide as the arm, or thinner than the thinnest arm, carry no relevant flow.
-    abscissa, typical = curves.arc_length(graph.points[path]), float(np.median(graph.radius[path]))
-    behind = graph.points[path[np.searchsorted(abscissa, abscissa[-1] - 3.0 * typical)]]
+    behind = points_mm[np.searchsorted(abscissa, abscissa[-1] - 3.0 * typical)]
     passable = graph.radius > max(0.5 * typical, ARM_RADIUS_MM)
     passable &= np.linalg.norm(graph.points - behind, axis=1) > 1.25 * typical
     passable[path[[0, -1]]] = True
     label = triangles.joined(graph.edges[passable[graph.edges].all(axis=1)], len(passable))
-    return bool(label[path[0]] != label[path[-1]])
-
-
-def _cut_of(points_mm: Floats, radius_mm: Floats, slenderness: float) -> tuple[Floats, Floats, float] | None:
-    """Return center and direction of the cut that opens an arm (path to its tip), and its radius; None for a sac."""
-    abscissa = curves.arc_length(points_mm)
     outside = abscissa > 1.5 * radius_mm[0]
-    if outside.sum() < 3:
+    if label[path[0]] == label[path[-1]] or outside.sum() < 3:
         return None
     typical = float(np.median(radius_mm[outside]))
     body = outside & (radius_mm > 0.75 * typical)
@@ -286,17 +239,14 @@ def _cut_of(points_mm: Floats, radius_mm: Floats, slenderness: float) -> tuple[F
     if length < slenderness * typical or radius_mm[outer].max() > ARM_SWELLING * typical or widening > ARM_WIDENING:
         return None
     end = float(abscissa[body][-1]) - typical
-    center, behind = curves.interpolate(abscissa, points_mm, np.array([end, end - 2 * typical]))
-    return center, (center - behind) / np.linalg.norm(center - behind), typical
+    center, before = curves.interpolate(abscissa, points_mm, np.array([end, end - 2 * typical]))
+    return center, (center - before) / np.linalg.norm(center - before), typical
 
 
 def cut_square(
     lumen: Surface, center_mm: Floats, direction: Floats, radius_mm: float, most: float = 1.0
 ) -> Surface | None:
-    """Cut off the wall beyond a plane, where it is connected to the section at a given center.
-
-    Shapes: `center_mm` (3,), `direction` (3,).
-    """
+    """Cut off the wall beyond a plane (center and direction (3,)), where it is connected to the section there."""
     height = (lumen.vertices_mm - center_mm) @ direction
     distance = np.linalg.norm(lumen.vertices_mm - center_mm, axis=1)
     beyond = height > 0

@@ -10,7 +10,7 @@ from vstent.anatomy.bulge import bulging, prominence_of_surface
 from vstent.errors import VesselError
 from vstent.geometry.surface import Surface
 from vstent.kernels import topology, triangles
-from vstent.kernels.arrays import Bools, Floats, Ints
+from vstent.kernels.arrays import Floats, Ints
 from vstent.units import counted, place
 
 WELD_OF_EXTENT: Final = 1e-6
@@ -56,11 +56,20 @@ def repair(surface: Surface, *, at_mm: Floats | None = None) -> tuple[Surface, t
     """
     if not len(surface.faces):
         raise VesselError("The surface has no triangles. Check the file.")
-    mesh = _once(_Mesh(surface.vertices_mm, surface.faces, ()), at_mm)
-    if mesh.notes:  # closing a hole at a pinched vertex leaves needle faces, and a second pass removes them
-        mesh = _Mesh(*_once(_Mesh(mesh.vertices, mesh.faces, ()), at_mm).geometry, mesh.notes)
-    vertices, faces = triangles.compact(mesh.vertices, mesh.faces)
-    return Surface(vertices, faces), mesh.notes
+    one_piece = partial(_one_piece, at_mm=at_mm)
+    mesh = _Mesh(surface.vertices_mm, surface.faces)
+    notes: tuple[str, ...] = ()
+    for _ in range(2):  # closing a hole at a pinched vertex leaves needle faces, and a second pass removes them
+        for step in (_welded, _cleaned, _opened, _turned, _unzipped, one_piece, _outward, _filled):
+            mesh = step(mesh)
+            if len(mesh.faces) < 4:
+                raise VesselError(
+                    "No surface is left after repair: all its faces are degenerate or loose. Check the file."
+                )
+        notes = notes or mesh.notes
+        if not notes:
+            break
+    return Surface(*triangles.compact(mesh.vertices, mesh.faces)), notes
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,27 +80,12 @@ class _Mesh:
     """(n, 3) positions in mm."""
     faces: Ints
     """(m, 3) vertex indices."""
-    notes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
     """One sentence for each change."""
-
-    @property
-    def geometry(self) -> tuple[Floats, Ints]:
-        """Vertices and faces."""
-        return self.vertices, self.faces
 
     def after(self, vertices: Floats, faces: Ints, note: str = "") -> "_Mesh":
         """Return the mesh after a step, with the note on that step."""
         return _Mesh(vertices, faces, (*self.notes, note) if note else self.notes)
-
-
-def _once(mesh: _Mesh, at_mm: Floats | None) -> _Mesh:
-    """Return the mesh after one pass of all repair steps."""
-    one_piece = partial(_one_piece, at_mm=at_mm)
-    for step in (_welded, _cleaned, _opened, _turned, _unzipped, one_piece, _outward, _filled):
-        mesh = step(mesh)
-        if len(mesh.faces) < 4:
-            raise VesselError("No surface is left after repair: all its faces are degenerate or loose. Check the file.")
-    return mesh
 
 
 def _welded(mesh: _Mesh) -> _Mesh:
@@ -123,14 +117,11 @@ def _cleaned(mesh: _Mesh) -> _Mesh:
 
 def _opened(mesh: _Mesh) -> _Mesh:
     """Return the mesh without membranes across the lumen and fins."""
-    total = 0
     faces = mesh.faces
     while (is_inner := topology.inner_sheets(mesh.vertices, faces)).any():
         faces = faces[~is_inner]
-        total += int(is_inner.sum())
-    return mesh.after(
-        mesh.vertices, faces, f"{counted(total, 'face')} of sheets inside the lumen removed." if total else ""
-    )
+    n = len(mesh.faces) - len(faces)
+    return mesh.after(mesh.vertices, faces, f"{counted(n, 'face')} of sheets inside the lumen removed." if n else "")
 
 
 def _turned(mesh: _Mesh) -> _Mesh:
@@ -165,26 +156,24 @@ def _one_piece(mesh: _Mesh, at_mm: Floats | None) -> _Mesh:
         return mesh
     order = np.argsort(-area)
     notable = [k for k in order if k == order[0] or area[k] > NOTABLE_OF_AREA * area.sum()]
+
+    def piece(k: int) -> Surface:
+        return Surface(mesh.vertices, mesh.faces[label == k])
+
     if at_mm is None:
-        kept = bulging(area, lambda k: prominence_of_surface(Surface(mesh.vertices, mesh.faces[label == k])))
+        kept = bulging(area, lambda k: prominence_of_surface(piece(k)))
     else:
-        kept = min(notable, key=lambda k: _gap_mm(mesh, label == k, at_mm))
-    left = [f"{area[k]:.1f} mm2 about {_middle(mesh, label == k)}" for k in notable if k != kept]
+        kept = min(notable, key=lambda k: piece(k).closest(at_mm[None])[1][0])
+    left = [
+        f"{area[k]:.1f} mm2 about {place(mesh.vertices[np.unique(mesh.faces[label == k])].mean(axis=0))}"
+        for k in notable
+        if k != kept
+    ]
     note = f"{counted(len(area) - 1, 'loose piece')} removed ({area[kept] / area.sum():.1%} of the area kept)"
     note += f", the largest of them {', '.join(left)}; choose another piece by a point near it (--at)." if left else "."
     if at_mm is None and kept != order[0]:
         note += " The piece with a bulge was kept, not the largest one."
     return mesh.after(mesh.vertices, mesh.faces[label == kept], note)
-
-
-def _gap_mm(mesh: _Mesh, member: Bools, at_mm: Floats) -> float:
-    """Return the distance of a point (3,) from a piece of the mesh, in mm."""
-    return float(Surface(mesh.vertices, mesh.faces[member]).closest(at_mm[None])[1][0])
-
-
-def _middle(mesh: _Mesh, member: Bools) -> str:
-    """Return the mean position of a piece of the mesh, as text."""
-    return place(mesh.vertices[np.unique(mesh.faces[member])].mean(axis=0))
 
 
 def _outward(mesh: _Mesh) -> _Mesh:
@@ -201,57 +190,43 @@ def _filled(mesh: _Mesh) -> _Mesh:
     vertices, faces = triangles.cap(mesh.vertices, mesh.faces, loops)
     diameter = 4 * triangles.volume(vertices[faces]) / float(triangles.areas(mesh.vertices[mesh.faces]).sum())
     wall_normal = triangles.vertex_normals(mesh.vertices, mesh.faces)
-    holes = [loop for loop in loops if _is_hole(mesh.vertices[loop], wall_normal[loop], diameter)]
-    left = [loop for loop in loops if not any(loop is hole for hole in holes)]
-    domes = [loop for loop in left if _is_dome(mesh, loop, left, wall_normal)]
-    sideways = [loop for loop in left if _is_in_wall(mesh.vertices[loop], wall_normal[loop])]
+    is_hole = [_is_hole(mesh.vertices[loop], wall_normal[loop], diameter) for loop in loops]
+    holes = [loop for loop, is_closed in zip(loops, is_hole, strict=True) if is_closed]
+    ends = [loop for loop, is_closed in zip(loops, is_hole, strict=True) if not is_closed]
+    notes = []
+    if holes:
+        widest_mm = max(triangles.perimeter(mesh.vertices[loop]) for loop in holes)
+        notes.append(f"{counted(len(holes), 'hole')} in the wall closed (the largest {widest_mm:.2g} mm around).")
+    area_vectors = [triangles.polygon_area_vector(_without_teeth(mesh.vertices[loop])) for loop in ends]
+    area_mm2 = np.array([float(np.linalg.norm(vector)) for vector in area_vectors])
+    closed, dome = list(holes), -1
+    if len(ends) > 2 and (area_mm2 == area_mm2.max()).sum() == 1:
+        # A sac that is cut open: the wall converges to the loop, yet it is wider than all other openings. The end of an
+        # artery has walls along it, also where it is cut obliquely; a branch is narrower than its parent.
+        widest = int(area_mm2.argmax())
+        loop, axis = ends[widest], area_vectors[widest]
+        center_mm = triangles.polygon_centroid(mesh.vertices[loop])
+        beside_mm = mesh.vertices[mesh.faces[np.isin(mesh.faces, loop).any(axis=1)]].mean(axis=(0, 1))
+        axis = axis * (np.sign(axis @ (center_mm - beside_mm)) / np.linalg.norm(axis))
+        if (wall_normal[loop] @ axis).mean() > CONVERGING:
+            dome = widest
+            closed.append(loop)
+            notes.append(
+                f"The widest opening, at {place(center_mm)}, is a sac that is cut open: the wall "
+                "converges to it. It was closed with a flat cap, so the sac is too small by the part that is missing."
+            )
+    for k, loop in enumerate(ends):
+        points = mesh.vertices[loop]
+        if k != dome and _is_in_wall(points, wall_normal[loop]):
+            notes.append(
+                f"The opening {triangles.perimeter(points) / np.pi:.1f} mm wide at "
+                f"{place(triangles.polygon_centroid(points))} faces sideways out of the wall. If no artery leaves "
+                "there, close it in the surface."
+            )
     filled_vertices, filled_faces = mesh.vertices, mesh.faces
-    for loop in holes + domes:
+    for loop in closed:
         filled_vertices, filled_faces = _fill(filled_vertices, filled_faces, loop)
-    notes = [_hole_note([mesh.vertices[loop] for loop in holes])] if holes else []
-    notes += [_dome_note(mesh.vertices[loop]) for loop in domes]
-    notes += [_sideways_note(mesh.vertices[loop]) for loop in sideways if not any(loop is dome for dome in domes)]
     return mesh.after(filled_vertices, filled_faces, " ".join(notes))
-
-
-def _is_dome(mesh: _Mesh, loop: Ints, loops: list[Ints], wall_normal: Floats) -> bool:
-    """Return whether a loop is a sac cut open: the wall converges to it, yet it is wider than all other openings."""
-    # The end of an artery has walls along it, also where it is cut obliquely; a branch is narrower than its parent.
-    others_mm2 = [_area_mm2(mesh, one) for one in loops if one is not loop]
-    if len(others_mm2) < 2 or _area_mm2(mesh, loop) <= max(others_mm2):
-        return False
-    beside = mesh.vertices[mesh.faces[np.isin(mesh.faces, loop).any(axis=1)]].mean(axis=(0, 1))
-    axis = triangles.polygon_area_vector(_without_teeth(mesh.vertices[loop]))
-    axis *= np.sign(axis @ (triangles.polygon_centroid(mesh.vertices[loop]) - beside)) / np.linalg.norm(axis)
-    return bool((wall_normal[loop] @ axis).mean() > CONVERGING)
-
-
-def _area_mm2(mesh: _Mesh, loop: Ints) -> float:
-    """Return the area that a loop encloses."""
-    return float(np.linalg.norm(triangles.polygon_area_vector(_without_teeth(mesh.vertices[loop]))))
-
-
-def _dome_note(points: Floats) -> str:
-    """Return the note on a sac that is cut open."""
-    return (
-        f"The widest opening, at {place(triangles.polygon_centroid(points))}, is a sac that is cut open: the wall "
-        "converges to it. It was closed with a flat cap, so the sac is too small by the part that is missing."
-    )
-
-
-def _hole_note(holes_mm: list[Floats]) -> str:
-    """Return the note on closed holes."""
-    widest_mm = max(triangles.perimeter(points) for points in holes_mm)
-    return f"{counted(len(holes_mm), 'hole')} in the wall closed (the largest {widest_mm:.2g} mm around)."
-
-
-def _sideways_note(points: Floats) -> str:
-    """Return the note on an opening in the side of the wall."""
-    return (
-        f"The opening {triangles.perimeter(points) / np.pi:.1f} mm wide at "
-        f"{place(triangles.polygon_centroid(points))} faces sideways out of the wall. If no artery leaves "
-        "there, close it in the surface."
-    )
 
 
 def _is_hole(points: Floats, wall_normal: Floats, diameter: float) -> bool:
@@ -259,10 +234,8 @@ def _is_hole(points: Floats, wall_normal: Floats, diameter: float) -> bool:
     width = triangles.perimeter(points) / np.pi
     smooth = _without_teeth(points)
     size = float(np.linalg.norm(triangles.polygon_area_vector(smooth)))
-    if (
-        width < ALWAYS_HOLE_OF_DIAMETER * diameter
-        or 4 * np.pi * size < SLIT_ROUNDNESS * triangles.perimeter(smooth) ** 2
-    ):
+    is_slit = 4 * np.pi * size < SLIT_ROUNDNESS * triangles.perimeter(smooth) ** 2
+    if width < ALWAYS_HOLE_OF_DIAMETER * diameter or is_slit:
         return True
     return width < WALL_HOLE_OF_DIAMETER * diameter and _is_in_wall(points, wall_normal)
 
@@ -274,30 +247,23 @@ def _is_in_wall(points: Floats, wall_normal: Floats) -> bool:
 
 
 def _without_teeth(points: Floats) -> Floats:
-    """Return a loop (n, 3) with its sawtooth removed, where it has enough vertices."""
-    return points if len(points) < 8 else _rounded(_rounded(points))
-
-
-def _rounded(points: Floats) -> Floats:
-    """Return a closed polygon (n, 3) smoothed once with weights 1/4, 1/2, 1/4."""
-    return 0.25 * (np.roll(points, 1, axis=0) + 2 * points + np.roll(points, -1, axis=0))
+    """Return a loop (n, 3) with its sawtooth removed by weights 1/4, 1/2, 1/4, where it has enough vertices."""
+    for _ in range(2 if len(points) >= 8 else 0):
+        points = 0.25 * (np.roll(points, 1, axis=0) + 2 * points + np.roll(points, -1, axis=0))
+    return points
 
 
 def _fill(vertices: Floats, faces: Ints, loop: Ints) -> tuple[Floats, Ints]:
     """Return the mesh with a loop closed by a least-area patch, or by a fan where it is long or no patch exists."""
     ring = loop[::-1]
-    patch = None if len(ring) > LONGEST_PATCHED else topology.least_area(vertices[ring], _joined(faces, ring))
-    if patch is None:
-        return triangles.cap(vertices, faces, [loop])
-    return vertices, np.concatenate([faces, ring[patch]]).astype(np.int32)
-
-
-def _joined(faces: Ints, ring: Ints) -> Bools:
-    """Return for each pair (n, n) of ring vertices whether the mesh already has an edge between them."""
-    place = np.full(faces.max() + 1, -1)
-    place[ring] = np.arange(len(ring))
-    a, b = place[triangles.directed_edges(faces)].T
-    joined = np.zeros((len(ring), len(ring)), dtype=bool)
-    both = (a >= 0) & (b >= 0)
-    joined[a[both], b[both]] = joined[b[both], a[both]] = True
-    return joined
+    if len(ring) <= LONGEST_PATCHED:
+        number = np.full(faces.max() + 1, -1)
+        number[ring] = np.arange(len(ring))
+        edges = number[triangles.directed_edges(faces)]
+        a, b = edges[(edges >= 0).all(axis=1)].T
+        is_joined = np.zeros((len(ring), len(ring)), dtype=bool)
+        is_joined[a, b] = is_joined[b, a] = True
+        patch = topology.least_area(vertices[ring], is_joined)
+        if patch is not None:
+            return vertices, np.concatenate([faces, ring[patch]]).astype(np.int32)
+    return triangles.cap(vertices, faces, [loop])

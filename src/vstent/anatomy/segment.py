@@ -1,7 +1,7 @@
 """Segment a scan: find the wall of the contrast-filled lumen."""
 
 from dataclasses import dataclass, replace
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Vessel
 from vstent.io.surfaces import GIANT_DIAMETER_MM, VESSEL_DIAMETER_MM
 from vstent.kernels import smoothing, topology, triangles
-from vstent.kernels.arrays import Bools, Floats, Ints
+from vstent.kernels.arrays import Bools, Floats
 from vstent.kernels.isosurface import isosurface
 from vstent.units import place
 
@@ -77,27 +77,38 @@ def segment(image: Image, *, threshold: float | None = None, at_mm: Floats | Non
         object is wider than any artery.
     """
     image = prepared(image, is_united=threshold is None)
-    lumen, notes, profile = propose(image, at_mm=at_mm) if threshold is None else _at(image, float(threshold), at_mm)
-    _refuse_wide(lumen, profile)
+    if threshold is None:
+        lumen, note, profile = propose(image, at_mm=at_mm)
+    else:
+        lumen = _lumen(image, float(threshold), at_mm)
+        profile = _profile(lumen)
+        note = f"Threshold {threshold:.4g} as given; the proposed one is {profile.wall_level:.4g}."
+    if 2 * profile.radius_mm > GIANT_DIAMETER_MM:
+        middle_mm = lumen.affine_mm[:3] @ [*(0.5 * (np.array(lumen.field.shape) - 1)), 1.0]
+        raise VesselError(
+            f"At threshold {lumen.threshold:.4g} the object near {place(middle_mm)} is {2 * profile.radius_mm:.0f} "
+            f"mm wide, and no artery is wider than {GIANT_DIAMETER_MM:g} mm: it is the head, bone or the field of "
+            "view. Set another threshold (--threshold), choose a point in the artery (--at), or crop the scan "
+            "where the two touch."
+        )
     surface, smooth_note = _smooth(_wall(lumen))
     if threshold is None:
         surface = _unblurred(surface, profile)
     surface, decimation_notes = _decimated(surface)
     size = " x ".join(f"{h:.3g}" for h in image.spacing_mm)
     share = lumen.n_voxels / lumen.n_above
-    found = f"The lumen has {lumen.n_voxels} voxels of {size} mm, {share:.0%} of all voxels above the threshold."
+    count = f"The lumen has {lumen.n_voxels} voxels of {size} mm, {share:.0%} of all voxels above the threshold."
     if lumen.others_mm:
-        found += f" Another object of similar size lies about {place(lumen.others_mm[0])}: --at chooses it."
+        count += f" Another object of similar size lies about {place(lumen.others_mm[0])}: --at chooses it."
     # The uncertainty is relative to the step, not to the threshold, because the zero of a scan's intensities is
     # arbitrary.
     off = BAND * (profile.lumen - profile.tissue)
     band_mm = 2 * off / profile.slope_per_mm
     band = f"A change of the threshold by {off:.3g} ({BAND:.0%} of the step from tissue to lumen) changes diameters by "
     band += f"+-{band_mm:.3f} mm ({band_mm / lumen.voxel_mm:.2f} voxel)."
-    all_notes = (*image.notes, *notes, band, found, smooth_note, *decimation_notes)
     return Vessel(
         surface,
-        notes=all_notes,
+        notes=(*image.notes, note, band, count, smooth_note, *decimation_notes),
         threshold_band_mm=band_mm,
         blur_mm=profile.blur_mm,
         voxel_mm=lumen.voxel_mm,
@@ -128,110 +139,55 @@ class Lumen:
         return float(np.abs(np.linalg.det(self.affine_mm[:3, :3])) ** (1 / 3))
 
 
-def propose(image: Image, *, at_mm: Floats | None = None) -> tuple[Lumen, tuple[str, ...], "Profile"]:
-    """Propose a threshold for the wall of the lumen.
+def propose(image: Image, *, at_mm: Floats | None = None) -> tuple[Lumen, str, "Profile"]:
+    """Return the vessel at a proposed threshold, or that near a point (3,), a note, and the profile across its wall.
 
     Vessels are far less than a tenth of the voxels, so the histogram of the scan does not show them. The threshold is
     found in two steps:
 
-    1. The first threshold is the mean intensity weighted with the squared gradient (Kittler et al. 1985).
+    1. The first threshold is the mean intensity weighted with the squared gradient (Kittler, Illingworth and Foeglein
+       1985, Comput. Vis. Graph. Image Process. 30:125).
     2. The vessel found with it is sampled by profiles along the normals of its wall. The threshold is half way between
-       the medians of tissue and lumen, the full width at half maximum (Hoogeveen et al. 1998).
+       the medians of tissue and lumen, the full width at half maximum (Hoogeveen, Bakker and Viergever 1998; journal
+       and page not verified).
 
     The wall of a cylinder of radius R, blurred with standard deviation s, is not at one half but at Phi(-s / (2 R)) of
     the step (mean curvature flow, to first order), where Phi is the standard normal distribution. The slope of the
     profile gives s. R is that of the whole vessel; `_unblurred` corrects branches and sacs.
-
-    Parameters
-    ----------
-    image : scan in which blood is brighter than the surrounding tissue.
-    at_mm : (3,) point in or near the requested vessel in mm; the largest vessel where not given.
-
-    Returns
-    -------
-    lumen : voxels of the vessel, with the proposed threshold.
-    notes : how the threshold was found.
-    profile : median profile across the wall.
-
-    References
-    ----------
-    Kittler, Illingworth and Foeglein 1985, Comput. Vis. Graph. Image Process. 30:125.
-
-    Hoogeveen, Bakker and Viergever 1998 (journal and page not verified).
     """
-    first, profile = _first(image, at_mm)
-    second = replace(first, threshold=profile.wall_level)
-    profile = _profile(second)
+    # The strongest edges of a scan may be those between head and air, or between field of view and padding. The object
+    # above such a threshold fills the scan, and the next threshold is computed within that object.
+    voxels = image.voxels
+    if at_mm is not None:
+        box = _box_around(image, at_mm, AROUND_MM)
+        voxels = voxels[box] if min(side.stop - side.start for side in box) > 2 else voxels
+    lumen = _lumen(image, _edge_level(voxels), at_mm)
+    profile = _profile(lumen)
+    for _ in range(MOST_GROUNDS):
+        if 2 * profile.radius_mm <= VESSEL_DIAMETER_MM[1] or lumen.n_voxels < FILLS * image.voxels.size:
+            break
+        to_air_mm = ndimage.distance_transform_edt(~(voxels < lumen.threshold), sampling=image.spacing_mm)
+        lumen = _lumen(image, _edge_level(voxels, to_air_mm > AIR_MM), at_mm)
+        profile = _profile(lumen)
+    profile = _profile(replace(lumen, threshold=profile.wall_level))
     lumen = _lumen(image, profile.wall_level, at_mm)
     note = (
         f"Threshold {lumen.threshold:.4g} proposed: half way between tissue ({profile.tissue:.4g}) and lumen "
         f"({profile.lumen:.4g}), corrected for the curvature of the wall and a blur of {profile.blur_mm:.2g} "
         "mm."
     )
-    return lumen, (note,), profile
-
-
-def _at(image: Image, threshold: float, at_mm: Floats | None) -> tuple[Lumen, tuple[str, ...], "Profile"]:
-    """Return the lumen at a given threshold, a note, and the profile across its wall."""
-    lumen = _lumen(image, threshold, at_mm)
-    profile = _profile(lumen)
-    note = f"Threshold {threshold:.4g} as given; the proposed one is {profile.wall_level:.4g}."
-    return lumen, (note,), profile
-
-
-def _refuse_wide(lumen: Lumen, profile: "Profile") -> None:
-    """Raise a VesselError if the object is wider than any artery."""
-    if 2 * profile.radius_mm <= GIANT_DIAMETER_MM:
-        return
-    middle_mm = lumen.affine_mm[:3] @ [*(0.5 * (np.array(lumen.field.shape) - 1)), 1.0]
-    raise VesselError(
-        f"At threshold {lumen.threshold:.4g} the object near {place(middle_mm)} is {2 * profile.radius_mm:.0f} "
-        f"mm wide, and no artery is wider than {GIANT_DIAMETER_MM:g} mm: it is the head, bone or the field of "
-        "view. Set another threshold (--threshold), choose a point in the artery (--at), or crop the scan "
-        "where the two touch."
-    )
+    return lumen, note, profile
 
 
 # -- voxels ------------------------------------------------------------------------------------------------------------
 
 
-def _first(image: Image, at_mm: Floats | None) -> tuple[Lumen, "Profile"]:
-    """Return the vessel at a first threshold, and the profile across its wall."""
-    # The strongest edges of a scan may be those between head and air, or between field of view and padding. The object
-    # above such a threshold fills the scan, and the next threshold is computed within that object.
-    voxels = image.voxels[_around(image, at_mm)]
-    lumen = _lumen(image, _edge_level(voxels), at_mm)
-    profile = _profile(lumen)
-    for _ in range(MOST_GROUNDS):
-        is_wide = 2 * profile.radius_mm > VESSEL_DIAMETER_MM[1]
-        if not is_wide or lumen.n_voxels < FILLS * image.voxels.size:
-            break
-        is_within = _clear_of(voxels < lumen.threshold, image.spacing_mm)
-        lumen = _lumen(image, _edge_level(voxels, is_within), at_mm)
-        profile = _profile(lumen)
-    return lumen, profile
-
-
-def _around(image: Image, at_mm: Floats | None) -> tuple[slice, ...]:
-    """Return the box of voxels within `AROUND_MM` of a point (3,); the whole scan without a point or far from it."""
-    whole = tuple(slice(0, n) for n in image.voxels.shape)
-    if at_mm is None:
-        return whole
-    low, high = _reach(image, at_mm, AROUND_MM)
-    return tuple(map(slice, low, high)) if (high - low > 2).all() else whole
-
-
-def _reach(image: Image, at_mm: Floats, reach_mm: float) -> tuple[Ints, Ints]:
-    """Return the first (3,) and last-plus-one (3,) voxel index of a box around a point (3,), clipped to the scan."""
+def _box_around(image: Image, at_mm: Floats, reach_mm: float) -> tuple[slice, ...]:
+    """Return the box of voxels within reach of a point (3,), clipped to the scan."""
     reach = np.ceil(reach_mm / image.spacing_mm).astype(int) + 1
     middle = np.round(image.to_index(np.asarray(at_mm, dtype=np.float64)[None])[0]).astype(int)
     low = np.clip(middle - reach, 0, image.voxels.shape)
-    return low, np.clip(middle + reach + 1, low, image.voxels.shape)
-
-
-def _clear_of(is_ground: Bools, spacing_mm: Floats) -> Bools:
-    """Return whether each voxel is farther than `AIR_MM` from the background."""
-    return np.asarray(ndimage.distance_transform_edt(~is_ground, sampling=spacing_mm) > AIR_MM)
+    return tuple(map(slice, low, np.clip(middle + reach + 1, low, image.voxels.shape)))
 
 
 def _edge_level(voxels: NDArray[Any], is_within: Bools | None = None) -> float:
@@ -257,17 +213,6 @@ def _edge_level(voxels: NDArray[Any], is_within: Bools | None = None) -> float:
     return float((weight * voxels[middle]).sum() / weight.sum())
 
 
-class _Pieces(NamedTuple):
-    """Connected pieces above a threshold."""
-
-    label: NDArray[Any]
-    """(i, j, k) number of the piece of each voxel, 0 for none."""
-    size: NDArray[Any]
-    """(pieces + 1,) number of voxels in each piece; 0 in the first entry."""
-    threshold: float
-    """Intensity above which voxels belong to a piece."""
-
-
 def _lumen(image: Image, threshold: float, at_mm: Floats | None) -> Lumen:
     """Return connected voxels above the threshold: the piece near a point, else that with a bulge or the largest."""
     above = image.voxels >= threshold
@@ -283,56 +228,39 @@ def _lumen(image: Image, threshold: float, at_mm: Floats | None) -> Lumen:
             f"At threshold {threshold:.4g} the largest object has {size.max(initial=0)} voxels (intensities "
             f"range from {image.voxels.min()} to {image.voxels.max()}). Set another threshold (--threshold)."
         )
-    pieces = _Pieces(label, size, threshold)
+
+    def box_of(number: int) -> tuple[slice, ...]:
+        return ndimage.find_objects(label, max_label=number)[number - 1]
+
     if at_mm is None:
-        chosen = bulging(size, lambda k: prominence(label[_box(label, k)] == k, image.spacing_mm))
+        chosen = bulging(size, lambda k: prominence(label[box_of(k)] == k, image.spacing_mm))
     else:
-        chosen = _nearest(image, pieces, np.asarray(at_mm, dtype=np.float64))
-    box = _with_margin(_box(label, chosen), label.shape)
+        box = _box_around(image, at_mm, FARTHEST_MM)
+        # Voxels are counted near the point only: the bone of a head has a hundred times as many voxels as an artery.
+        n_near = np.bincount(label[box].ravel(), minlength=len(size))
+        n_near[size < FEWEST_VOXELS] = 0
+        index = np.argwhere(np.isin(label[box], np.flatnonzero(n_near > NOTABLE_PIECE * n_near.max())))
+        index += [side.start for side in box]
+        distance_mm = np.linalg.norm(image.to_mm(index.astype(np.float64)) - at_mm, axis=1)
+        if distance_mm.min(initial=np.inf) > FARTHEST_MM:
+            raise VesselError(
+                f"There is no lumen within {FARTHEST_MM:g} mm of {place(at_mm)}: nothing notable there is brighter "
+                f"than threshold {threshold:.4g}. Check the point, which is in LPS mm (--at), or set "
+                "another threshold (--threshold)."
+            )
+        chosen = int(label[tuple(index[distance_mm.argmin()])])
+    margin = int(PROFILE_VOXELS) + 2  # the length of the profiles
+    sides = zip(box_of(chosen), label.shape, strict=True)
+    box = tuple(slice(max(0, s.start - margin), min(n, s.stop + margin)) for s, n in sides)
     part = label[box]
     field = image.voxels[box].astype(np.float32)
     below = np.float32(threshold - 0.5 * max(float(field.max()) - threshold, 1e-6))
     field[(part > 0) & (part != chosen)] = below
     affine = np.array(image.affine_mm)
     affine[:3, 3] = image.to_mm(np.array([[s.start for s in box]]))[0]
-    others = [_box(label, k) for k in similar(size) if k != chosen]
-    middles = [image.to_mm(np.array([[0.5 * (s.start + s.stop - 1) for s in box]]))[0] for box in others]
+    others = [box_of(k) for k in similar(size) if k != chosen]
+    middles = [image.to_mm(np.array([[0.5 * (s.start + s.stop - 1) for s in other]]))[0] for other in others]
     return Lumen(field, affine, threshold, int(size[chosen]), int(size.sum()), tuple(middles))
-
-
-def _box(label: NDArray[Any], number: int) -> tuple[slice, ...]:
-    """Return the bounding box of a piece."""
-    found: tuple[slice, ...] = ndimage.find_objects(label, max_label=number)[number - 1]
-    return found
-
-
-def _nearest(image: Image, pieces: _Pieces, at_mm: Floats) -> int:
-    """Return the number of the piece nearest to a point (3,), small debris ignored."""
-    low, high = _reach(image, at_mm, FARTHEST_MM)
-    part = pieces.label[tuple(map(slice, low, high))]
-    # Voxels are counted near the point only: the bone of a head has a hundred times as many voxels as an artery.
-    n_near = np.bincount(part.ravel(), minlength=len(pieces.size))
-    n_near[pieces.size < FEWEST_VOXELS] = 0
-    index = np.argwhere(np.isin(part, np.flatnonzero(n_near > NOTABLE_PIECE * n_near.max())))
-    distance = (
-        np.linalg.norm(image.to_mm((low + index).astype(np.float64)) - at_mm, axis=1)
-        if len(index)
-        else np.array([np.inf])
-    )
-    if distance.min() > FARTHEST_MM:
-        place = ", ".join(f"{v:.1f}" for v in at_mm)
-        raise VesselError(
-            f"There is no lumen within {FARTHEST_MM:g} mm of ({place}) mm: nothing notable there is brighter "
-            f"than threshold {pieces.threshold:.4g}. Check the point, which is in LPS mm (--at), or set "
-            "another threshold (--threshold)."
-        )
-    return int(part[tuple(index[distance.argmin()])])
-
-
-def _with_margin(box: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, ...]:
-    """Return a box widened by the length of the profiles, clipped to the scan."""
-    margin = int(PROFILE_VOXELS) + 2
-    return tuple(slice(max(0, s.start - margin), min(n, s.stop + margin)) for s, n in zip(box, shape, strict=True))
 
 
 # -- profiles across the wall ------------------------------------------------------------------------------------------
@@ -379,29 +307,18 @@ def _profile(lumen: Lumen) -> Profile:
     inverse = np.linalg.inv(lumen.affine_mm)
     index = points.reshape(-1, 3) @ inverse[:3, :3].T + inverse[:3, 3]
     value = ndimage.map_coordinates(lumen.field, index.T, order=1, mode="nearest").reshape(len(some), -1)
-    value = value[_is_thick(value, depth_mm, lumen)]
+    # Profiles count where they stay in the lumen on their inner side; where hardly any do, the deeper half.
+    n_within = (value[:, depth_mm < 0] >= lumen.threshold).sum(axis=1)
+    stays = n_within == (depth_mm < 0).sum()
+    value = value[stays if stays.mean() > 0.05 else n_within >= np.median(n_within)]
     course, outer = np.median(value, axis=0), depth_mm > 0.55 * PROFILE_VOXELS * lumen.voxel_mm
     # The plateau is where the blur has the least effect. In a thin vessel that is its axis, not the deepest sample.
     plateau, tissue = float(course.max()), float(np.median(value[:, outer]))
-    slope = _slope(course, depth_mm, 0.5 * (plateau + tissue))
+    steps, height = -np.gradient(course, depth_mm), float(np.ptp(course))
+    near = np.abs(course - 0.5 * (plateau + tissue)) <= 0.35 * np.ptp(course)
+    slope = max(float(steps[near].max(initial=0.0)), 1e-6 * height + 1e-300)
     radius_mm = 2 * lumen.n_voxels * lumen.voxel_mm**3 / surface.area_mm2
     return Profile(plateau, tissue, slope, radius_mm, lumen.voxel_mm)
-
-
-def _is_thick(value: NDArray[Any], depth_mm: Floats, lumen: Lumen) -> Bools:
-    """Return whether each profile (n,) stays in the lumen on its inner side; the deeper half where hardly any do."""
-    stays = value[:, depth_mm < 0].min(axis=1) >= lumen.threshold
-    if stays.mean() > 0.05:
-        return stays
-    within = (value[:, depth_mm < 0] >= lumen.threshold).sum(axis=1)
-    return within >= np.median(within)
-
-
-def _slope(profile: NDArray[Any], depth_mm: Floats, level: float) -> float:
-    """Return the steepest descent of a profile around a level, per mm."""
-    steps = -np.gradient(profile, depth_mm)
-    near = np.abs(profile - level) <= 0.35 * np.ptp(profile)
-    return max(float(steps[near].max(initial=0.0)), 1e-6 * float(np.ptp(profile)) + 1e-300)
 
 
 # -- mesh --------------------------------------------------------------------------------------------------------------
@@ -426,13 +343,12 @@ def _taubin(surface: Surface) -> Surface:
 
 def _smooth(rough: Surface) -> tuple[Surface, str]:
     """Return the smoothed surface with its volume restored, and a note."""
-    volume = _capped_volume_mm3(rough)
+    volume = rough.closed.volume_mm3
     smooth = _taubin(rough)
-    lost = volume - _capped_volume_mm3(smooth)
+    lost = volume - smooth.closed.volume_mm3
     vertices = smooth.vertices_mm + (lost / smooth.area_mm2) * smooth.vertex_normals
-    return Surface(
-        vertices, smooth.faces
-    ), f"Smoothing changed the volume by {-lost / volume:+.2%}; the change was corrected."
+    note = f"Smoothing changed the volume by {-lost / volume:+.2%}; the change was corrected."
+    return Surface(vertices, smooth.faces), note
 
 
 def _unblurred(surface: Surface, profile: Profile) -> Surface:
@@ -461,15 +377,8 @@ def _decimated(fine: Surface) -> tuple[Surface, tuple[str, ...]]:
         return fine, ()
     import fast_simplification
 
-    vertices, faces = fast_simplification.simplify(
-        np.array(fine.vertices_mm), np.array(fine.faces), target_count=MOST_FACES
+    coarse = Surface(
+        *fast_simplification.simplify(np.array(fine.vertices_mm), np.array(fine.faces), target_count=MOST_FACES)
     )
-    coarse = Surface(vertices, faces)
-    change = _capped_volume_mm3(coarse) / _capped_volume_mm3(fine) - 1
-    return coarse, (f"{len(fine.faces)} triangles reduced to {len(faces)} (volume {change:+.2%}).",)
-
-
-def _capped_volume_mm3(surface: Surface) -> float:
-    """Return the volume of a surface with its open loops capped, in mm3."""
-    vertices, faces = triangles.cap(surface.vertices_mm, surface.faces, surface.boundary_loops)
-    return triangles.volume(vertices[faces])
+    change = coarse.closed.volume_mm3 / fine.closed.volume_mm3 - 1
+    return coarse, (f"{len(fine.faces)} triangles reduced to {len(coarse.faces)} (volume {change:+.2%}).",)

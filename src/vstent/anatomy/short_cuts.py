@@ -48,56 +48,46 @@ arteries have less."""
 
 
 def along_arms(graph: medial.Medial, paths: Sequence[Ints], radius_cap: Floats) -> list[Ints]:
-    """Correct each path to follow both arms of a fork where it cuts through the crotch between them.
-
-    Shapes: `paths` (k,), `radius_cap` (n,).
-    """
-    times, led = medial.cost_graph(graph, radius_cap), []
+    """Correct each path (k,) to follow both arms of a fork where it cuts through the crotch between them."""
+    times, corrected = medial.cost_graph(graph, radius_cap), []
     for path in paths:
         _, before = medial.shortest_paths(times, int(path[-1]))
-        found = path
-        for other in paths:
-            way = _by_way_of(other, medial.path_to(before, int(other[-1]))[::-1])
-            found = _led(found, [both for both in _apart(found, way) if _is_crotch(graph, *both)])
-        led.append(found)
-    return led
+        along = path
+        for other in paths:  # up to where it meets the way onward to this path's end, and on along that way
+            onward = medial.path_to(before, int(other[-1]))[::-1]
+            fork = int(np.isin(other, onward).argmax())
+            way = np.concatenate([other[:fork], onward[np.flatnonzero(onward == other[fork])[0] :]])
+            along = _replaced(along, [both for both in _apart(along, way) if _is_crotch(graph, *both)])
+        corrected.append(along)
+    return corrected
 
 
 def around_sacs(graph: medial.Medial, path: Ints, speed_cap: float) -> tuple[Ints, list[str]]:
-    """Correct a path to follow the artery around each sac that it runs through, where there is one.
-
-    Shapes: `path` (k,).
-    """
-    points, artery_mm = _artery_along(graph, path)
-    tree = cKDTree(points)
-    if not (graph.radius[path] > WIDE * artery_mm[tree.query(graph.points[path])[1]]).any():
-        return path, []
-    parent_mm = artery_mm[tree.query(graph.points)[1]]
-    apart = _apart(path, _shunning(graph, path, parent_mm, speed_cap))
-    sacs = [both for both in apart if _is_artery(graph, *both, parent_mm)]
-    return _led(path, sacs), [_sentence(graph, through) for through, _ in sacs]
-
-
-def _artery_along(graph: medial.Medial, path: Ints) -> tuple[Floats, Floats]:
-    """Return evenly spaced points (n, 3) along a path and the radius (n,) of the artery there, without its sacs."""
+    """Correct a path (k,) to follow the artery around each sac that it runs through, where there is one; with notes."""
     abscissa = curves.arc_length(graph.points[path])
     even = np.linspace(0.0, abscissa[-1], max(2, round(abscissa[-1] / STEP_MM)))
     radius = np.interp(even, abscissa, graph.radius[path])
     artery_mm = curves.running_percentile(radius, WIDE_PERCENTILE, round(WIDE_WINDOW_MM / STEP_MM))
-    return curves.interpolate(abscissa, graph.points[path], even), artery_mm
-
-
-def _shunning(graph: medial.Medial, path: Ints, parent_mm: Floats, speed_cap: float) -> Ints:
-    """Return the path between a path's ends that avoids spheres wider than the artery nearby."""
+    tree = cKDTree(curves.interpolate(abscissa, graph.points[path], even))
+    if not (graph.radius[path] > WIDE * artery_mm[tree.query(graph.points[path])[1]]).any():
+        return path, []
+    parent_mm = artery_mm[tree.query(graph.points)[1]]
     speed = speed_cap * parent_mm * np.minimum(1.0, WIDE * parent_mm / graph.radius) ** SHUN
     _, before = medial.shortest_paths(medial.cost_graph(graph, speed), int(path[0]))
-    return medial.path_to(before, int(path[-1]))
-
-
-def _by_way_of(other: Ints, onward: Ints) -> Ints:
-    """Return a path up to where it meets another one, continued along that one."""
-    fork = int(np.isin(other, onward).argmax())
-    return np.concatenate([other[:fork], onward[np.flatnonzero(onward == other[fork])[0] :]])
+    sacs, notes = [], []
+    for through, around in _apart(path, medial.path_to(before, int(path[-1]))):
+        taken_mm, widest = graph.radius[around], through[graph.radius[through].argmax()]
+        is_sac = graph.radius[widest] >= SAC * taken_mm.max() and taken_mm.min() >= AS_WIDE * parent_mm[around].min()
+        if not is_sac or not _is_beside(graph, through, around):
+            continue
+        sacs.append((through, around))
+        at_mm = ", ".join(f"{x:.0f}" for x in graph.points[widest])
+        notes.append(
+            f"The sac {2 * graph.radius[widest]:.0f} mm wide near {at_mm} mm opens into the artery at two places, "
+            "or touches it. The artery is assumed to run around it, and the wider opening to be the neck. If this "
+            "is wrong, separate them in the surface."
+        )
+    return _replaced(path, sacs), notes
 
 
 def _apart(path: Ints, other: Ints) -> Iterator[tuple[Ints, Ints]]:
@@ -112,7 +102,7 @@ def _apart(path: Ints, other: Ints) -> Iterator[tuple[Ints, Ints]]:
             left, here = k, there
 
 
-def _led(path: Ints, instead: Sequence[tuple[Ints, Ints]]) -> Ints:
+def _replaced(path: Ints, instead: Sequence[tuple[Ints, Ints]]) -> Ints:
     """Return a path with some of its pieces replaced."""
     for through, around in instead:
         first, last = (int(np.flatnonzero(path == end)[0]) for end in through[[0, -1]])
@@ -120,45 +110,22 @@ def _led(path: Ints, instead: Sequence[tuple[Ints, Ints]]) -> Ints:
     return path
 
 
-def _is_artery(graph: medial.Medial, through: Ints, around: Ints, parent_mm: Floats) -> bool:
-    """Return whether the path around a sac, vertices (k,), is an artery beside it."""
-    taken_mm = graph.radius[around]
-    if graph.radius[through].max() < SAC * taken_mm.max():
-        return False
-    if taken_mm.min() < AS_WIDE * parent_mm[around].min():
-        return False
-    return _is_beside(graph, through, around)
-
-
 def _is_crotch(graph: medial.Medial, through: Ints, around: Ints) -> bool:
     """Return whether a path runs through the crotch of a fork while the other (k,) follows its arms."""
     cut_mm, taken_mm = graph.radius[through], graph.radius[around]
     is_sac = cut_mm.max() > CROTCH_SAC * taken_mm.max() and taken_mm.min() > AS_WIDE * cut_mm.min()
     is_between = taken_mm.min() > CROTCH * cut_mm.min() and taken_mm.max() < SAC * cut_mm.max()
-    return (is_sac or is_between) and _is_beside(graph, through, around) and _is_lumen_between(graph, through, around)
+    if not (is_sac or is_between) or not _is_beside(graph, through, around):
+        return False
+    # The space between the paths is lumen; in a ring of arteries it is tissue.
+    start, end = graph.points[around], graph.points[through]
+    across = end[cKDTree(end).query(start)[1]] - start
+    between = start + np.linspace(0.0, 1.0, N_BETWEEN + 2)[1:-1, None, None] * across
+    distance, sphere = cKDTree(graph.points).query(between)
+    return bool((distance < graph.radius[sphere]).mean() > LUMEN)
 
 
 def _is_beside(graph: medial.Medial, through: Ints, around: Ints) -> bool:
     """Return whether a path (k,) is somewhere outside the spheres of another."""
     apart_mm = np.linalg.norm(graph.points[around, None] - graph.points[through], axis=2) - graph.radius[through]
     return bool((apart_mm.min(axis=1) > BESIDE * graph.radius[around]).any())
-
-
-def _is_lumen_between(graph: medial.Medial, through: Ints, around: Ints) -> bool:
-    """Return whether the space between two paths is lumen; in a ring of arteries it is tissue."""
-    ends = graph.points[around], graph.points[through]
-    across = ends[1][cKDTree(ends[1]).query(ends[0])[1]] - ends[0]
-    between = ends[0] + np.linspace(0.0, 1.0, N_BETWEEN + 2)[1:-1, None, None] * across
-    distance, sphere = cKDTree(graph.points).query(between)
-    return bool((distance < graph.radius[sphere]).mean() > LUMEN)
-
-
-def _sentence(graph: medial.Medial, through: Ints) -> str:
-    """Return the note on a sac around which a path is corrected."""
-    widest = through[graph.radius[through].argmax()]
-    place = ", ".join(f"{x:.0f}" for x in graph.points[widest])
-    return (
-        f"The sac {2 * graph.radius[widest]:.0f} mm wide near {place} mm opens into the artery at two places, "
-        "or touches it. The artery is assumed to run around it, and the wider opening to be the neck. If this "
-        "is wrong, separate them in the surface."
-    )

@@ -20,7 +20,7 @@ from vstent.anatomy.short_cuts import along_arms, around_sacs
 from vstent.errors import VesselError
 from vstent.geometry.spheres import centered
 from vstent.geometry.surface import Surface
-from vstent.geometry.vessel import Centerline, Opening, Vessel
+from vstent.geometry.vessel import Centerline, Vessel
 from vstent.kernels import curves, medial
 from vstent.kernels.arrays import Floats, Ints
 
@@ -69,66 +69,66 @@ def trace(vessel: Vessel, *, inlet_mm: Floats | None = None) -> Vessel:
         vessel = with_inlets(vessel, np.atleast_2d(np.asarray(inlet_mm, dtype=np.float64)))
     vessel, graph, paths = _paths(vessel, spheres)
     for _ in range(MOST_CONTACTS):
-        parted = _parted(vessel, graph, paths, holds_inlet=inlet_mm is not None)
-        if parted is None:
+        contacts = (find_contact(graph.points[path], graph.radius[path], graph) for path in paths)
+        parted = (
+            part(vessel, contact, holds_inlet=inlet_mm is not None) for contact in contacts if contact is not None
+        )
+        without_contact = next((other for other in parted if other is not None), None)
+        if without_contact is None:
             break
-        vessel, graph, paths = _paths(parted, parted.lumen.medial)
+        vessel, graph, paths = _paths(without_contact, without_contact.lumen.medial)
     lines = tuple(_centerline(vessel.lumen, graph.points[path], graph.radius[path]) for path in paths)
-    vessel = guessed(vessel) if is_guess else vessel
-    return replace(vessel, centerlines=lines)
+    return replace(guessed(vessel) if is_guess else vessel, centerlines=lines)
 
 
 def _paths(vessel: Vessel, spheres: medial.Medial) -> tuple[Vessel, medial.Medial, list[Ints]]:
     """Return the vessel with its reachable openings, the medial graph, and the path to each of these openings."""
-    vessel, graph = _reachable(vessel, _graph(vessel, spheres))
-    paths = _shortest(vessel, graph, np.full(len(graph.radius), np.inf))
-    cap_mm = _radius_cap(graph, paths)
-    paths = along_arms(graph, _shortest(vessel, graph, cap_mm), cap_mm)
-    found = [around_sacs(graph, path, SPEED_CAP) for path in paths]
-    notes = dict.fromkeys([*vessel.notes, *chain(*(told for _, told in found))])
-    return replace(vessel, notes=tuple(notes)), graph, [path for path, _ in found]
+    vessel, graph = _reachable(vessel, spheres)
+    ends = range(len(graph.points) - len(vessel.openings), len(graph.points))
 
+    def shortest(cap_mm: Floats | float) -> list[Ints]:
+        _, before = medial.shortest_paths(medial.cost_graph(graph, cap_mm), ends[0])
+        return [medial.path_to(before, end) for end in ends[1:]]
 
-def _parted(vessel: Vessel, graph: medial.Medial, paths: list[Ints], *, holds_inlet: bool) -> Vessel | None:
-    """Return the vessel without the first contact between arteries that a path crosses; None without such a contact."""
-    contacts = (find_contact(graph.points[path], graph.radius[path], graph) for path in paths)
-    parted = (part(vessel, contact, holds_inlet=holds_inlet) for contact in contacts if contact is not None)
-    return next((one for one in parted if one is not None), None)
+    cap_mm = _radius_cap(graph, shortest(np.inf))
+    paths = along_arms(graph, shortest(cap_mm), cap_mm)
+    corrected = [around_sacs(graph, path, SPEED_CAP) for path in paths]
+    notes = dict.fromkeys([*vessel.notes, *chain(*(notes for _, notes in corrected))])
+    return replace(vessel, notes=tuple(notes)), graph, [path for path, _ in corrected]
 
 
 def parent_radius_mm(abscissa_mm: Floats, radius_mm: Floats) -> Floats:
-    """Return the radius (n,) of the artery at each point of a path in mm, without the sacs that it passes.
+    """Return the radius (n,) of the artery at each point (n,) of a path in mm, without the sacs that it passes.
 
-    The result is a running percentile of the inscribed radii over `PARENT_WINDOW_MM`.
-
-    Shapes: `abscissa_mm` (n,), `radius_mm` (n,).
+    The result is a running percentile of the inscribed radii (n,) over `PARENT_WINDOW_MM`.
     """
     step = float(abscissa_mm[-1]) / max(len(abscissa_mm) - 1, 1)
     return curves.running_percentile(radius_mm, PARENT_PERCENTILE, round(PARENT_WINDOW_MM / step))
 
 
-def _graph(vessel: Vessel, spheres: medial.Medial) -> medial.Medial:
-    """Return the medial graph with the openings joined to it as its last vertices, in their order."""
+def _reachable(vessel: Vessel, spheres: medial.Medial) -> tuple[Vessel, medial.Medial]:
+    """Return the vessel without unreachable narrow outlets, and the medial graph with its openings as last vertices.
+
+    Raise an error for other unreachable openings.
+    """
     ends = np.array([opening.center_mm for opening in vessel.openings])
     reach = np.array([0.25 * opening.diameter_mm for opening in vessel.openings])
-    return medial.with_terminals(spheres, ends, reach)
-
-
-def _reachable(vessel: Vessel, graph: medial.Medial) -> tuple[Vessel, medial.Medial]:
-    """Return vessel and graph without unreachable narrow outlets; raise an error for other unreachable openings."""
-    first = len(graph.points) - len(vessel.openings)
-    cost, _ = medial.shortest_paths(medial.cost_graph(graph, np.full(len(graph.radius), np.inf)), first)
-    is_reached = np.isfinite(cost[first:])
-    lost = [opening for opening, reached in zip(vessel.openings, is_reached, strict=True) if not reached]
+    graph = medial.with_terminals(spheres, ends, reach)
+    first = len(spheres.points)
+    is_reached = np.isfinite(medial.shortest_paths(medial.cost_graph(graph), first)[0])
+    lost = [opening for opening, reached in zip(vessel.openings, is_reached[first:], strict=True) if not reached]
     leads_out = any(outlet not in lost for outlet in vessel.outlets)
     for opening in lost:
         if opening.is_inlet or opening.diameter_mm > THIN * vessel.inlet.diameter_mm or not leads_out:
-            raise VesselError(_unreachable(vessel.inlet, opening))
-    kept = np.ones(len(graph.points), dtype=bool)
-    kept[first:] = is_reached
+            raise VesselError(
+                f"{opening.role}, {opening.described}, is not connected to the inlet (diameter "
+                f"{vessel.inlet.diameter_mm:.1f} mm), because the lumen is interrupted between them: lower the "
+                "threshold, or remove that part"
+            )
+    is_reached[:first] = True
     notes = tuple(f"An opening {opening.described} has no connection to the inlet and was closed." for opening in lost)
     openings = named(vessel.inlets, [opening for opening in vessel.openings if opening not in lost])
-    return replace(vessel, openings=openings, notes=(*vessel.notes, *notes)), medial.keep(graph, kept)
+    return replace(vessel, openings=openings, notes=(*vessel.notes, *notes)), graph.keep(is_reached)
 
 
 def _radius_cap(graph: medial.Medial, paths: Sequence[Ints]) -> Floats:
@@ -143,35 +143,15 @@ def _radius_cap(graph: medial.Medial, paths: Sequence[Ints]) -> Floats:
     return SPEED_CAP * np.concatenate(parents)[nearest]
 
 
-def _shortest(vessel: Vessel, graph: medial.Medial, radius_cap: Floats) -> list[Ints]:
-    """Return the path from the inlet to each other opening, as vertices of the graph."""
-    inlet = len(graph.points) - len(vessel.openings)
-    _, before = medial.shortest_paths(medial.cost_graph(graph, radius_cap), inlet)
-    return [medial.path_to(before, end) for end in range(inlet + 1, len(graph.points))]
-
-
-def _unreachable(inlet: Opening, opening: Opening) -> str:
-    """Return the error message for an opening that is not connected to the inlet."""
-    return (
-        f"{opening.role}, {opening.described}, is not connected to the inlet (diameter {inlet.diameter_mm:.1f} "
-        "mm), because the lumen is interrupted between them: lower the threshold, or remove that part"
-    )
-
-
 def _centerline(wall: Surface, path_mm: Floats, radius_mm: Floats) -> Centerline:
     """Return a smooth, evenly spaced centerline along a path with inscribed radii."""
     points = curves.resample(path_mm, STEP_MM)
     abscissa, along = curves.arc_length(path_mm), np.linspace(0.0, 1.0, len(points))
     radius = np.maximum(np.interp(along * abscissa[-1], abscissa, radius_mm), STEP_MM)
+    weight = np.ones(len(points))
+    weight[[0, -1]] = 1e6  # the ends stay
     # Voronoi vertices scatter at scales below a diameter, so only longer waves are kept. Third differences preserve
     # bends. Second differences would pull them inwards.
     waves = 2.0 * radius * SMOOTHED_DIAMETERS / (2 * np.pi * STEP_MM)
-    points = centered(wall, curves.smooth(points, _held_ends(len(points)), waves**6, order=3), radius)
+    points = centered(wall, curves.smooth(points, weight, waves**6, order=3), radius)
     return Centerline(points, wall.inscribed_radius(points))
-
-
-def _held_ends(n: int) -> Floats:
-    """Return smoothing weights (n,) that fix both ends."""
-    weight = np.ones(n)
-    weight[[0, -1]] = 1e6
-    return weight

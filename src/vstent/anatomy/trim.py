@@ -16,9 +16,8 @@ from vstent.anatomy.restore.bulges import Bulge, find_bulges
 from vstent.anatomy.restore.tubes import tubes_of
 from vstent.anatomy.trace import parent_radius_mm, trace
 from vstent.errors import InputError
-from vstent.geometry.murray import murray_shares
 from vstent.geometry.surface import Surface
-from vstent.geometry.vessel import Centerline, Vessel
+from vstent.geometry.vessel import Centerline, Vessel, murray_shares
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Floats
 from vstent.units import place
@@ -30,8 +29,6 @@ DOWNSTREAM_MM: Final = 25.0
 """Default length in mm of every other artery, downstream of the sac's middle or to another inlet."""
 SPARE_MM: Final = 5.0
 """By default, an artery is cut only if more than this length is removed, in mm."""
-SAME_MM: Final = 1e-6
-"""Vertices closer than this are the same, in mm."""
 STRIDE_MM: Final = 1.0
 """Length in mm of the centerline that defines the direction of a cut."""
 
@@ -41,72 +38,27 @@ class _Way(NamedTuple):
 
     side: str
     """Name of the side: before or beyond the sac."""
-    option: str
-    """Option that sets the length to keep."""
     usual_mm: float
     """Default length to keep."""
     given_mm: float | None
     """Length given by the user; None for the default."""
     neck_mm: float
     """Distance from the sac's middle to the edge of the neck."""
-    clear_mm: float
-    """Smallest distance between a cut and the neck."""
-    whole_mm: float
-    """Length of the artery."""
-
-    @property
-    def asked_mm(self) -> float:
-        """The given length, or the default."""
-        return self.usual_mm if self.given_mm is None else self.given_mm
-
-    @property
-    def is_short(self) -> bool:
-        """Whether a cut at that length would be in the sac or too close to it."""
-        return self.asked_mm < min(self.neck_mm + self.clear_mm, self.whole_mm)
-
-    @property
-    def has_grown(self) -> bool:
-        """Whether the default length is too short and the least length is used instead."""
-        return self.given_mm is None and self.is_short
-
-    @property
-    def least_mm(self) -> float:
-        """Least length that clears the neck, rounded up to 0.1 mm."""
-        return float(np.ceil(10 * (self.neck_mm + self.clear_mm)) / 10)
+    least_mm: float
+    """Least length that clears the neck by a radius of the artery, rounded up to 0.1 mm."""
+    is_short: bool
+    """Whether a cut at the length to keep would be in the sac or too close to it."""
 
     @property
     def kept_mm(self) -> float:
-        """Length to keep."""
-        return self.least_mm if self.has_grown else self.asked_mm
+        """Length to keep: as given, or the default or least length."""
+        usual_mm = self.least_mm if self.is_short else self.usual_mm
+        return usual_mm if self.given_mm is None else self.given_mm
 
     @property
     def spare_mm(self) -> float:
         """The artery is cut only if more than this length is removed."""
         return SPARE_MM if self.given_mm is None else 0.0
-
-
-class _Cut(NamedTuple):
-    """A cut through the artery."""
-
-    center_mm: Floats
-    """(3,) point on a centerline."""
-    radius_mm: float
-    """Radius of the artery at the cut."""
-    sense: int
-    """Side that is removed: behind (-1) or ahead (1) along the centerline."""
-
-
-class _Site(NamedTuple):
-    """Position of the sac on its artery."""
-
-    parent: Centerline
-    """Centerline of the artery."""
-    sac_mm: float
-    """Abscissa of the sac's middle on it."""
-    before: _Way
-    """Artery upstream of the sac's middle."""
-    beyond: _Way
-    """Artery downstream of the sac's middle."""
 
 
 def trim(
@@ -138,104 +90,94 @@ def trim(
     InputError
         When a given length is not above zero, or so short that the cut would be within one artery radius of the neck.
     """
-    _refuse_none(upstream_mm, downstream_mm)
+    for length_mm in (upstream_mm, downstream_mm):
+        if length_mm is not None and not 0 < length_mm < np.inf:
+            raise InputError(
+                f"the artery cannot be trimmed to {length_mm:g} mm beside the sac: give a length above zero"
+            )
     bulges = find_bulges(vessel.lumen, tubes_of(vessel.centerlines), at_mm)
     if not bulges:
         return vessel
-    site = _site(vessel, bulges[0], upstream_mm, downstream_mm)
+    parent, sac_mm, before, beyond = _site(vessel, bulges[0], upstream_mm, downstream_mm)
     lumen = vessel.lumen
-    cuts: list[_Cut] = []
-    for line, abscissa_mm, sense in _cuts(vessel, site):
-        center, ahead = line.at(np.array([abscissa_mm, abscissa_mm + sense * STRIDE_MM]))
-        direction = (ahead - center) / np.linalg.norm(ahead - center)
+    cuts: list[tuple[Floats, float, int]] = []
+    for line, abscissa_mm, sense in _cuts(vessel, parent, sac_mm, before, beyond):
+        center, next_mm = line.at(np.array([abscissa_mm, abscissa_mm + sense * STRIDE_MM]))
+        direction = (next_mm - center) / np.linalg.norm(next_mm - center)
         radius = float(np.interp(abscissa_mm, line.abscissa_mm, line.inscribed_radius_mm))
         cut = cut_square(lumen, center, direction, radius)
-        part = None if cut is None else Surface(*triangles.part_at(cut.vertices_mm, cut.faces, bulges[0].dome_mm))
+        if cut is None:
+            continue
+        part = Surface(*triangles.part_at(cut.vertices_mm, cut.faces, bulges[0].dome_mm))
         # The part beyond a cut may belong to the sac, where the sac touches its artery a second time.
-        if part is not None and _holds(part, bulges[0]):
+        if np.asarray(cKDTree(part.vertices_mm).query(bulges[0].points_mm)[0]).max() < 1e-6:
             lumen = part
-            cuts.append(_Cut(center, radius, sense))
+            cuts.append((center, radius, sense))
     if not cuts:
         return vessel
-    inlet_mm, told = _inlets_of(vessel, _ends_mm(vessel, cuts, lumen), lumen)
-    notes = (*vessel.notes, *_trimmed(site), *told, *_left_out(lumen, bulges[1:]))
+    inlet_mm, inlet_notes = _inlets_of(vessel, cuts, lumen)
+    lost = [
+        f"Another bulge, {bulge.height_mm:.1f} mm high at {place(bulge.dome_mm)}, was cut off; choose it by "
+        "that point (--at)."
+        for bulge in bulges[1:]
+        if lumen.closest(bulge.dome_mm[None])[1][0] > bulge.height_mm / 2
+    ]
+    notes = (*vessel.notes, *_notes(before, beyond), *inlet_notes, *lost)
     return trace(replace(vessel, lumen=lumen, openings=(), centerlines=(), notes=notes), inlet_mm=inlet_mm)
 
 
-def _ends_mm(vessel: Vessel, cuts: list[_Cut], lumen: Surface) -> Floats:
-    """Return where the blood of each opening of the vessel passes an end of the trimmed lumen, (k, 3), in mm."""
-    # This is the first cut along the opening's centerline, or the cut upstream of the sac for an opening beyond that.
+def _notes(before: _Way, beyond: _Way) -> list[str]:
+    """Return notes on the lengths that are kept."""
+    trimmed = (
+        f"Trimmed to {before.kept_mm:.4g} mm of vessel proximal and {beyond.kept_mm:.4g} mm distal to the "
+        "middle of the sac."
+    )
+    longer = [
+        f"{way.kept_mm:.4g} mm are kept {way.side} the middle of the sac instead of {way.usual_mm:g}, "
+        f"because the neck extends {way.neck_mm:.1f} mm from there."
+        for way in (before, beyond)
+        if way.is_short
+    ]
+    return [trimmed, *longer]
+
+
+def _inlets_of(vessel: Vessel, cuts: list[tuple[Floats, float, int]], lumen: Surface) -> tuple[Floats, list[str]]:
+    """Return the centers (i, 3) of a trimmed lumen's inlets, and notes on inlets of the vessel that were cut off.
+
+    The cuts are center, radius, and the side that is removed, as in `_cuts`.
+    """
+    # The blood of an opening passes the first cut along its centerline, or the cut upstream of the sac beyond that.
     loops = cKDTree(lumen.loop_centers_mm)
-    before = [cut.center_mm for cut in cuts if cut.sense < 0]
-    ahead = [cut for cut in cuts if cut.sense > 0]
-    centers_mm = np.array([cut.center_mm for cut in ahead]).reshape(-1, 3)
-    ends_mm = [before[0] if before else vessel.inlet.center_mm]
+    behind_mm = [center for center, _, sense in cuts if sense < 0]
+    ahead = [(center, radius) for center, radius, sense in cuts if sense > 0]
+    centers_mm = np.array([center for center, _ in ahead]).reshape(-1, 3)
+    ends_mm = [[*behind_mm, vessel.inlet.center_mm][0]]
     for opening, line in zip(vessel.far_ends, vessel.centerlines, strict=True):
         place_mm, off_mm = curves.project(line.points_mm, centers_mm)
-        through = np.flatnonzero(off_mm < [cut.radius_mm for cut in ahead])
+        through = np.flatnonzero(off_mm < [radius for _, radius in ahead])
         is_left = loops.query(opening.center_mm)[0] < STILL * opening.diameter_mm
         first = centers_mm[through[np.argsort(place_mm[through])]]
-        passed = [*first, *([] if is_left else before), opening.center_mm]
-        ends_mm.append(passed[0])
-    return np.array(ends_mm)
-
-
-def _inlets_of(vessel: Vessel, ends_mm: Floats, lumen: Surface) -> tuple[Floats, list[str]]:
-    """Return the centers (i, 3) of a lumen's inlets, and notes on inlets of the vessel that were cut off."""
-    loop = np.asarray(cKDTree(lumen.loop_centers_mm).query(ends_mm)[1])
+        ends_mm.append([*first, *([] if is_left else behind_mm), opening.center_mm][0])
+    loop = np.asarray(cKDTree(lumen.loop_centers_mm).query(np.array(ends_mm))[1])
     brought = np.bincount(loop, np.concatenate([murray_shares(vessel.inlets), -murray_shares(vessel.outlets)]))
     of_inlets = dict.fromkeys(loop[: len(vessel.inlets)].tolist())
     inlets = [k for k in of_inlets if k == loop[0] or brought[k] > 0]
-    told = [
+    notes = [
         f"{opening.role}, {opening.described}, was cut off: "
         f"{'its blood enters elsewhere' if k in inlets else 'that cut is an outlet now'}."
         for n, (opening, k) in enumerate(zip(vessel.inlets, loop, strict=False))
         if k in loop[:n] or k not in inlets
     ]
-    return lumen.loop_centers_mm[inlets], told
+    return lumen.loop_centers_mm[inlets], notes
 
 
-def _holds(lumen: Surface, bulge: Bulge) -> bool:
-    """Return whether a lumen still has all vertices of a bulge."""
-    return bool(np.asarray(cKDTree(lumen.vertices_mm).query(bulge.points_mm)[0]).max() < SAME_MM)
+def _site(
+    vessel: Vessel, bulge: Bulge, upstream_mm: float | None, downstream_mm: float | None
+) -> tuple[Centerline, float, _Way, _Way]:
+    """Return the centerline of a sac's artery, the abscissa of the sac's middle, and the artery on both sides of it.
 
-
-def _refuse_none(*lengths_mm: float | None) -> None:
-    """Raise an InputError for lengths that are not above zero."""
-    for length_mm in lengths_mm:
-        if length_mm is not None and not 0 < length_mm < np.inf:
-            raise InputError(
-                f"the artery cannot be trimmed to {length_mm:g} mm beside the sac: give a length above zero"
-            )
-
-
-def _trimmed(site: _Site) -> list[str]:
-    """Return notes on the lengths that are kept."""
-    before, beyond = site.before, site.beyond
-    return [
-        f"Trimmed to {before.kept_mm:.4g} mm of vessel proximal and {beyond.kept_mm:.4g} mm distal to the "
-        "middle of the sac.",
-        *(
-            f"{way.kept_mm:.4g} mm are kept {way.side} the middle of the sac instead of {way.usual_mm:g}, "
-            f"because the neck extends {way.neck_mm:.1f} mm from there."
-            for way in (before, beyond)
-            if way.has_grown
-        ),
-    ]
-
-
-def _left_out(lumen: Surface, bulges: list[Bulge]) -> list[str]:
-    """Return notes on sacs that were cut off."""
-    return [
-        f"Another bulge, {bulge.height_mm:.1f} mm high at {place(bulge.dome_mm)}, was cut off; choose it by "
-        "that point (--at)."
-        for bulge in bulges
-        if lumen.closest(bulge.dome_mm[None])[1][0] > bulge.height_mm / 2
-    ]
-
-
-def _site(vessel: Vessel, bulge: Bulge, upstream_mm: float | None, downstream_mm: float | None) -> _Site:
-    """Return the position of a sac on its artery and the lengths to keep; raise an InputError if one is too short."""
+    Raise an InputError if a given length is too short.
+    """
     foot = cKDTree(bulge.foot_mm)
     gaps = [np.asarray(foot.query(line.points_mm)[0]) for line in vessel.centerlines]
     parent = vessel.centerlines[int(np.argmin([gap.min() for gap in gaps]))]
@@ -243,31 +185,38 @@ def _site(vessel: Vessel, bulge: Bulge, upstream_mm: float | None, downstream_mm
     sac_mm = float(foot_mm.mean())
     radius_mm = parent_radius_mm(parent.abscissa_mm, parent.inscribed_radius_mm)
     clear_mm = float(np.interp(sac_mm, parent.abscissa_mm, radius_mm))
-    first_mm, last_mm = float(sac_mm - foot_mm.min()), float(foot_mm.max() - sac_mm)
-    beyond_mm = parent.length_mm - sac_mm
-    before = _Way("before", "--upstream", UPSTREAM_MM, upstream_mm, first_mm, clear_mm, sac_mm)
-    beyond = _Way("beyond", "--downstream", DOWNSTREAM_MM, downstream_mm, last_mm, clear_mm, beyond_mm)
-    for way in (before, beyond):
-        if way.is_short and not way.has_grown:
-            raise InputError(_short(way, bulge))
-    return _Site(parent, sac_mm, before, beyond)
+    ways = []
+    for side, option, usual_mm, given_mm, neck_mm, whole_mm in (
+        ("before", "--upstream", UPSTREAM_MM, upstream_mm, float(sac_mm - foot_mm.min()), sac_mm),
+        (
+            "beyond",
+            "--downstream",
+            DOWNSTREAM_MM,
+            downstream_mm,
+            float(foot_mm.max() - sac_mm),
+            parent.length_mm - sac_mm,
+        ),
+    ):
+        least_mm = float(np.ceil(10 * (neck_mm + clear_mm)) / 10)
+        is_short = (usual_mm if given_mm is None else given_mm) < min(neck_mm + clear_mm, whole_mm)
+        if is_short and given_mm is not None:
+            raise InputError(
+                f"{given_mm:g} mm of artery {side} the middle of the sac at "
+                f"{place(bulge.foot_mm.mean(axis=0))} would be a cut through the sac or next to it, because its neck "
+                f"extends {neck_mm:.1f} mm from there: give {option} {least_mm:.1f} or more"
+            )
+        ways.append(_Way(side, usual_mm, given_mm, neck_mm, least_mm, is_short))
+    return parent, sac_mm, ways[0], ways[1]
 
 
-def _short(way: _Way, bulge: Bulge) -> str:
-    """Return the error message for a length that is too short."""
-    return (
-        f"{way.asked_mm:g} mm of artery {way.side} the middle of the sac at "
-        f"{place(bulge.foot_mm.mean(axis=0))} would be a cut through the sac or next to it, because its neck "
-        f"extends {way.neck_mm:.1f} mm from there: give {way.option} {way.least_mm:.1f} or more"
-    )
-
-
-def _cuts(vessel: Vessel, site: _Site) -> list[tuple[Centerline, float, int]]:
+def _cuts(
+    vessel: Vessel, parent: Centerline, sac_mm: float, before: _Way, beyond: _Way
+) -> list[tuple[Centerline, float, int]]:
     """Return for each cut its centerline, its abscissa, and the side to remove: behind (-1) or ahead (1)."""
-    parent, sac_mm, before, beyond = site
     cuts = [(parent, sac_mm - before.kept_mm, -1)] if sac_mm > before.kept_mm + before.spare_mm else []
     for line in vessel.centerlines:
-        fork_mm = min(_fork_mm(line, parent), line.length_mm)
+        apart = np.flatnonzero(curves.project(parent.points_mm, line.points_mm)[1] > line.inscribed_radius_mm)
+        fork_mm = float(line.abscissa_mm[apart[0]]) if len(apart) else line.length_mm
         # A branch that leaves upstream of the sac is measured from the sac back to its fork and then along the branch.
         way_mm = beyond.kept_mm
         abscissa_mm = sac_mm + way_mm if fork_mm >= sac_mm else 2 * fork_mm - sac_mm + way_mm
@@ -276,9 +225,3 @@ def _cuts(vessel: Vessel, site: _Site) -> list[tuple[Centerline, float, int]]:
         if line.length_mm > abscissa_mm + beyond.spare_mm:
             cuts.append((line, abscissa_mm, 1))
     return cuts
-
-
-def _fork_mm(line: Centerline, parent: Centerline) -> float:
-    """Return the abscissa where a centerline leaves that of the parent artery; its length for the parent itself."""
-    apart = np.flatnonzero(curves.project(parent.points_mm, line.points_mm)[1] > line.inscribed_radius_mm)
-    return float(line.abscissa_mm[apart[0]]) if len(apart) else line.length_mm

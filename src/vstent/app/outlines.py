@@ -10,7 +10,7 @@ from vstent.devices.stent import Stent
 from vstent.geometry.image import Image
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy
-from vstent.kernels import clipping
+from vstent.kernels import triangles
 from vstent.kernels.arrays import Floats
 from vstent.reporting.packing import Packer
 
@@ -42,7 +42,7 @@ def outlines(image: Image | Grid, anatomy: Anatomy, stents: Sequence[Stent], axi
 def section(image: Image | Grid, surface: Surface, axis: int, index: int) -> Floats:
     """Return the segments (s, 2, 2) in which the plane of a slice cuts a surface, as voxel indices in the slice."""
     place = image.to_index(surface.vertices_mm)
-    found = clipping.section(place, surface.faces, place[:, axis] - index)
+    found = triangles.section(place, surface.faces, place[:, axis] - index)
     return np.delete(found, axis, axis=2)
 
 

@@ -39,7 +39,7 @@ from vstent.flow.settings import FlowSettings
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy, Opening
 from vstent.io.archive import load_data
-from vstent.kernels import clipping
+from vstent.kernels import triangles
 from vstent.kernels.arrays import Floats
 from vstent.reporting.packing import message
 from vstent.reporting.scene import (
@@ -549,7 +549,7 @@ def _section(surface: Surface, center: Floats, frame: Floats) -> list[float]:
     """Return the section of a surface near the axis as segments x1, y1, x2, y2 in the plane."""
     near = np.linalg.norm(surface.corners_mm[:, 0] - center, axis=1) < SECTION_REACH_MM
     offset = surface.vertices_mm - center
-    segments = clipping.section(offset, surface.faces[near], offset @ frame[0])
+    segments = triangles.section(offset, surface.faces[near], offset @ frame[0])
     return np.round(segments @ frame[1:].T, 3).ravel().tolist()
 
 

@@ -57,9 +57,9 @@ def _done(arguments: argparse.Namespace) -> int:
             return 0
         if arguments.command.__module__ in (app.__name__, devices.__name__):  # they need no kernels to start
             return int(arguments.command(arguments))
-        from vstent.kernels.first_use import telling
+        from vstent.kernels.first_use import reporting_compilation
 
-        with telling(_first_use, helper=HELPER):
+        with reporting_compilation(_first_use, helper=HELPER):
             return int(arguments.command(arguments))
     except VstentError as error:
         sentence, code = str(error), BAD_INPUT if isinstance(error, InputError) else FAILED

@@ -6,8 +6,7 @@ from typing import Final, TypeAlias
 import numpy as np
 
 from vstent.flow.settings import FlowSettings
-from vstent.geometry.murray import murray_shares
-from vstent.geometry.vessel import Vessel
+from vstent.geometry.vessel import Vessel, murray_shares
 
 MEAN_INLET_SPEED_M_S: Final = 0.27
 """Default mean speed in an inlet, m/s, for an internal carotid artery."""

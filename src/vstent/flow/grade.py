@@ -12,8 +12,8 @@ from vstent.flow.domain import mean_diameter_mm
 from vstent.flow.indices import neck_diameter_mm, parent_diameter_mm
 from vstent.flow.lattice.setup import CELL_REYNOLDS
 from vstent.flow.settings import LATTICE
-from vstent.geometry.murray import murray_shares
 from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import murray_shares
 from vstent.kernels.arrays import Floats
 from vstent.units import M_PER_MM
 

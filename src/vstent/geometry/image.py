@@ -26,7 +26,6 @@ class Image:
     """DICOM modality; empty where the file does not state it."""
     notes: tuple[str, ...] = ()
     """Assumptions made while reading the scan, one sentence each."""
-
     is_oriented: bool = True
     """Whether the file states where left, right, front and back are; raw voxels do not."""
 
@@ -54,16 +53,9 @@ class Image:
         return np.clip(index, 0, np.array(self.voxels.shape) - 1).astype(np.int32)
 
     def cropped(self, corners_mm: Floats) -> "Image":
-        """Return the voxels of a box along the image axes.
+        """Return the voxels of a box along the image axes, given two opposite corners (2, 3) in LPS mm.
 
-        Parameters
-        ----------
-        corners_mm : (2, 3) opposite corners of the box in LPS mm.
-
-        Raises
-        ------
-        InputError
-            The box holds too few voxels.
+        An InputError is raised when it holds too few voxels.
         """
         first, last = self.box_between(corners_mm)
         if (last - first + 1 < FEWEST_ACROSS).any():

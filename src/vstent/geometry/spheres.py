@@ -11,7 +11,7 @@ import numpy as np
 
 from vstent.geometry.surface import Surface
 from vstent.kernels import curves, triangles
-from vstent.kernels.arrays import Floats, Ints
+from vstent.kernels.arrays import Floats
 from vstent.kernels.medial import widest_in_section
 
 N_RAYS: Final = 24
@@ -32,17 +32,9 @@ SMOOTHED_DIAMETERS: Final = 0.25
 
 
 def centered(wall: Surface, path_mm: Floats, radius_mm: Floats) -> Floats:
-    """Move the points of a smooth path to the centers of the largest spheres in its sections; its ends stay.
+    """Move the points (n, 3) of a smooth path to the centers of the largest spheres in its sections; its ends stay.
 
-    Parameters
-    ----------
-    wall : wall of the lumen.
-    path_mm : (n, 3) evenly spaced points near the medial axis, in mm.
-    radius_mm : (n,) approximate radii of the inscribed spheres there, in mm.
-
-    Returns
-    -------
-    path_mm : (n, 3) moved points in mm.
+    The points are evenly spaced near the medial axis, and the radii (n,) of the inscribed spheres there approximate.
     """
     step_mm = curves.arc_length(path_mm)[-1] / (len(path_mm) - 1)
     waves = 2.0 * radius_mm * SMOOTHED_DIAMETERS / (2 * np.pi * step_mm)
@@ -58,35 +50,27 @@ def centered(wall: Surface, path_mm: Floats, radius_mm: Floats) -> Floats:
 
 def _to_widest(wall: Surface, path_mm: Floats, radius_mm: Floats) -> Floats:
     """Return the vectors (n, 3) from points of a path to the centers of the largest nearby spheres in its sections."""
-    # The wall is represented by its tangent planes where the rays of the section meet it.
     frames = curves.parallel_frames(path_mm)
     angle = 2 * np.pi * np.arange(N_RAYS) / N_RAYS
-    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    rays = (circle @ frames[:, 1:]).reshape(-1, 3)
+    rays = (np.stack([np.cos(angle), np.sin(angle)], axis=1) @ frames[:, 1:]).reshape(-1, 3)
     origins = np.repeat(path_mm, N_RAYS, axis=0)
     distance, face = wall.first_hits(origins, rays)
     along = np.where(np.isfinite(distance), distance, 0.0)
-    height, normal = _bulge(wall, origins + along[:, None] * rays, face)
+    # The wall is represented by its tangent planes where the rays of the section meet the smooth wall, at a height
+    # above the mesh.
+    corners, normals = wall.corners_mm[face], wall.smooth_normals[face]
+    weight = triangles.barycentric(corners, origins + along[:, None] * rays)
+    height = 0.5 * (weight * np.roll(weight, -1, axis=1) * triangles.edge_rises(corners, normals)).sum(axis=1)
+    normal = np.einsum("fk,fkd->fd", weight, normals)
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     plane = np.where(np.isfinite(distance), along * np.einsum("ij,ij->i", normal, rays) + height, np.inf)
-    slope = np.einsum("nrd,nkd->nrk", normal.reshape(-1, N_RAYS, 3), frames[:, 1:])
     ring = plane.reshape(-1, N_RAYS)
+    slope = np.einsum("nrd,nkd->nrk", normal.reshape(-1, N_RAYS, 3), frames[:, 1:])
     shift = widest_in_section(ring, slope, GAIN, NEAR * radius_mm)
     size = np.linalg.norm(shift, axis=1) / (NEAR * radius_mm)
-    shift *= (_trust(ring) / (1.0 + size**2))[:, None]
+    # The center of a section is reliable where the section is round, not in a fork.
+    nearest = np.nan_to_num(np.maximum(ring.min(axis=1, keepdims=True), 1e-300), posinf=1e-300)
+    excess = np.clip(ring / nearest, 1.0, 3.0).mean(axis=1) - 1.0
+    trust = 1.0 / (1.0 + (excess / OPEN) ** 4)
+    shift *= (trust / (1.0 + size**2))[:, None]
     return np.asarray(np.einsum("nk,nkd->nd", shift, frames[:, 1:]))
-
-
-def _trust(ring_mm: Floats) -> Floats:
-    """Return the reliability (n,) of the center of sections with wall distances (n, rays): 1 if round, 0 in a fork."""
-    nearest = np.nan_to_num(np.maximum(ring_mm.min(axis=1, keepdims=True), 1e-300), posinf=1e-300)
-    excess = np.clip(ring_mm / nearest, 1.0, 3.0).mean(axis=1) - 1.0
-    return np.asarray(1.0 / (1.0 + (excess / OPEN) ** 4))
-
-
-def _bulge(wall: Surface, points_mm: Floats, face: Ints) -> tuple[Floats, Floats]:
-    """Return the height (n,) of the smooth wall above points (n, 3) of its faces (n,), and its unit normals (n, 3)."""
-    corners, normal = wall.corners_mm[face], wall.smooth_normals[face]
-    weight = triangles.barycentric(corners, points_mm)
-    height = 0.5 * (weight * np.roll(weight, -1, axis=1) * triangles.edge_rises(corners, normal)).sum(axis=1)
-    there = np.einsum("fk,fkd->fd", weight, normal)
-    return height, there / np.maximum(np.linalg.norm(there, axis=1, keepdims=True), 1e-300)

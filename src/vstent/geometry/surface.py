@@ -59,7 +59,7 @@ class Surface:
         return np.where((least < np.cos(CREASE_RAD))[:, None, None], self.normals[:, None], normals)
 
     @cached_property
-    def curved(self) -> tree.Curved:
+    def curved(self) -> tree.Tree:
         """Bounding-box tree of the smooth surface through the vertices."""
         return tree.curved(self.tree, self.smooth_normals)
 
@@ -101,50 +101,25 @@ class Surface:
 
     @cached_property
     def medial(self) -> medial.Medial:
-        """Centers, radii and adjacency of the maximum inscribed spheres.
-
-        Raises
-        ------
-        VesselError
-            When no sphere fits inside.
-        """
+        """Centers, radii and adjacency of the maximum inscribed spheres; a VesselError where no sphere fits inside."""
         samples, normals = triangles.sample(self.vertices_mm, self.faces)
-        found = medial.spheres(samples, normals, self.closed.tree, self.loop_centers_mm)
-        if not len(found.points):
+        spheres = medial.spheres(samples, normals, self.closed.tree, self.loop_centers_mm)
+        if not len(spheres.points):
             raise VesselError(
                 "the surface encloses no room for blood: it is flat, or a splinter; give the vessel's wall"
             )
-        return found
+        return spheres
 
     def closest(self, points_mm: Floats) -> tuple[Floats, Floats, Ints]:
-        """Return the closest points of the surface.
-
-        Parameters
-        ----------
-        points_mm : (n, 3) points in mm.
-
-        Returns
-        -------
-        closest_mm : (n, 3) closest points of the surface in mm.
-        distance_mm : (n,) distances in mm.
-        face : (n,) indices of the faces with the closest points.
-        """
+        """Return the closest points (n, 3) of the surface and their distances (n,), both in mm, and faces (n,)."""
         return tree.closest_points(self.tree, points_mm)
 
     def inscribed_radius(self, centers_mm: Floats) -> Floats:
-        """Return the radius of the largest sphere around each point inside the smooth surface.
+        """Return the radius (n,), in mm, of the largest sphere around each point (n, 3) inside the smooth surface.
 
         A triangle is a chord of the wall. On a convex wall it lies inside by an amount that grows with the square of
         its edge length, so a sphere that touches it is too small. The wall is therefore curved over every face
         according to the normals at its corners.
-
-        Parameters
-        ----------
-        centers_mm : (n, 3) centers in mm.
-
-        Returns
-        -------
-        radius_mm : (n,) radii in mm.
         """
         return tree.inscribed_radii(self.curved, centers_mm)
 
@@ -153,13 +128,7 @@ class Surface:
         return tree.signed_distances(self.tree, points_mm)
 
     def crosses(self, starts_mm: Floats, ends_mm: Floats) -> Bools:
-        """Return whether each segment (n,) crosses the surface.
-
-        Parameters
-        ----------
-        starts_mm : (n, 3) first points of the segments in mm.
-        ends_mm : (n, 3) last points of the segments in mm.
-        """
+        """Return whether each segment between points (n, 3) in mm crosses the surface."""
         return tree.segments_cross(self.tree, starts_mm, ends_mm)
 
     def first_hit(self, origins_mm: Floats, directions: Floats) -> Floats:
@@ -167,16 +136,5 @@ class Surface:
         return self.first_hits(origins_mm, directions)[0]
 
     def first_hits(self, origins_mm: Floats, directions: Floats) -> tuple[Floats, Ints]:
-        """Return the distance along rays to the first face, and that face.
-
-        Parameters
-        ----------
-        origins_mm : (n, 3) origins of the rays in mm.
-        directions : (n, 3) unit vectors.
-
-        Returns
-        -------
-        distance_mm : (n,) distances in mm; inf where a ray hits no face.
-        face : (n,) indices of the faces.
-        """
+        """Return the distance (n,) in mm along unit rays (n, 3) to the first face, inf without one, and that face."""
         return tree.first_hits(self.tree, origins_mm, directions)

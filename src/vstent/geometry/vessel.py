@@ -1,5 +1,6 @@
 """Data classes of an artery: `Opening`, `Centerline`, `Vessel`, `Aneurysm`, `Candidate`, `Path` and `Anatomy`."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -46,17 +47,21 @@ class Opening:
         """Whether blood enters through it."""
         return self.role.startswith("inlet")
 
+    def away_mm(self, point_mm: Floats) -> float:
+        """Return the distance of a point (3,) from its center, in mm."""
+        return float(np.linalg.norm(self.center_mm - point_mm))
+
 
 def roles(n_inlets: int, n_outlets: int) -> list[str]:
-    """Return the roles of a vessel's openings in their order: inlets first, then outlets.
-
-    Parameters
-    ----------
-    n_inlets : number of inlets.
-    n_outlets : number of outlets.
-    """
+    """Return the roles of a vessel's openings in their order: inlets first, then outlets."""
     inlets = ["inlet", *(f"inlet_{k}" for k in range(2, n_inlets + 1))]
     return [*inlets, *(f"outlet_{k}" for k in range(1, n_outlets + 1))]
+
+
+def murray_shares(openings: Sequence[Opening]) -> Floats:
+    """Return the fraction of the flow through each opening (k,), as its diameter cubed (Murray 1926, PNAS 12:207)."""
+    cubes = np.array([opening.diameter_mm**3 for opening in openings])
+    return np.asarray(cubes / cubes.sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,13 +311,7 @@ class Anatomy:
         return self.paths[0]
 
     def path(self, name: str) -> Path:
-        """Return the path of a name.
-
-        Raises
-        ------
-        InputError
-            There is none of this name.
-        """
+        """Return the path of a name; raise an InputError where there is none."""
         for path in self.paths:
             if path.name == name:
                 return path

@@ -11,20 +11,7 @@ Bools = NDArray[np.bool_]
 
 
 def read_only(values: Any, dtype: DTypeLike, shape: tuple[int, ...], name: str) -> NDArray[Any]:
-    """Return `values` as a new read-only contiguous array.
-
-    Parameters
-    ----------
-    values : array_like; values.
-    dtype : dtype; type of the array.
-    shape : tuple of; expected shape; -1 stands for any length.
-    name : field name for the error message.
-
-    Raises
-    ------
-    ValueError
-        When the shape differs.
-    """
+    """Return a new read-only contiguous array; raise a ValueError naming the field unless it has a shape (-1: any)."""
     array = np.array(values, dtype=dtype, order="C", copy=True)
     if array.ndim != len(shape) or any(want not in (-1, have) for want, have in zip(shape, array.shape, strict=True)):
         raise ValueError(f"{name} must have shape {shape} (-1: any), not {array.shape}")

@@ -53,7 +53,7 @@ def _private_folder() -> Path:
     return Path(own)
 
 
-def kept_in(sources: Path) -> Path:
+def cache_folder(sources: Path) -> Path:
     """Return the folder where numba keeps what it compiles from a source folder; it is writable."""
     name = f"{sources.name}_{sha1(str(sources).encode(), usedforsecurity=False).hexdigest()}"
     given = os.environ.get("NUMBA_CACHE_DIR")
@@ -63,17 +63,12 @@ def kept_in(sources: Path) -> Path:
 
 
 def forget_outdated(sources: Path, *also: Path) -> None:
-    """Remove compiled kernels whose sources have changed.
+    """Remove compiled kernels whose sources, or those in further folders that they call, have changed.
 
     Numba checks only a kernel's own file, not those of the functions compiled into it. After an upgrade that changes
     only these, it would use outdated code.
-
-    Parameters
-    ----------
-    sources : folder of the kernels.
-    also : further folders with functions that they call.
     """
-    place = kept_in(sources)
+    place = cache_folder(sources)
     files = [file for folder in (sources, *also) for file in sorted(folder.glob("*.py"))]
     digest = sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
     try:
@@ -82,5 +77,5 @@ def forget_outdated(sources: Path, *also: Path) -> None:
             for index in place.glob("*.nbi"):
                 index.unlink(missing_ok=True)
             (place / STAMP).write_text(digest)
-    except OSError:  # the folder is not writable, so that nothing is compiled into it
-        return
+    except OSError:
+        return  # the folder is not writable, so that nothing is compiled into it

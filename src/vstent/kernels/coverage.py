@@ -9,43 +9,28 @@ from vstent.kernels.arrays import Floats
 
 
 def covered_fractions(nodes: Floats, starts: Floats, ends: Floats, radius: Floats, samples: int) -> Floats:
-    """Return the fraction (rows - 1, columns) of every grid cell that is covered by wires.
+    """Return the fraction (rows - 1, columns) of every cell of a grid (rows, columns, 3) that is covered by wires.
 
-    Sample points of a low-discrepancy sequence are tested against nearby wire segments, all projected onto the plane of
-    the cell. The sequence has a different offset in every cell, so that a regular wire pattern cannot fall between the
-    points.
-
-    Parameters
-    ----------
-    nodes : (rows, columns, 3); Grid; columns are periodic.
-    starts, ends : (m, 3); ends of the wire segments, which must be shorter than the grid spacing.
-    radius : (m,); Half-widths of the wires.
-    samples : number of sample points per cell and direction.
+    Sample points of a low-discrepancy sequence, `samples` per direction, are tested against nearby wire segments (m, 3)
+    of half-widths `radius` (m,), all projected onto the plane of the cell. The sequence has a different offset in every
+    cell, so that a regular wire pattern cannot fall between the points. Columns are periodic, and the segments must be
+    shorter than the grid spacing.
     """
-    rows, columns = nodes.shape[:2]
     nodes = np.array(nodes, order="C")  # a writable copy: numba compiles separate code for read-only arrays
     home = homes(nodes, 0.5 * (starts + ends))
     order = np.argsort(home, kind="stable")
-    first = np.searchsorted(home[order], np.arange(rows * columns + 1)).astype(np.int32)
-    return _fractions(
-        nodes,
-        np.ascontiguousarray(starts[order]),
-        np.ascontiguousarray(ends[order]),
-        np.ascontiguousarray(radius[order]),
-        first,
-        samples,
-    )
+    first = np.searchsorted(home[order], np.arange(nodes.shape[0] * nodes.shape[1] + 1)).astype(np.int32)
+    starts, ends, radius = (np.ascontiguousarray(values[order]) for values in (starts, ends, radius))
+    return _fractions(nodes, starts, ends, radius, first, samples)
 
 
 @njit(cache=True)
 def homes(nodes: Any, points: Any) -> Any:
-    """Return the number (n,) of the grid node nearest to each of consecutive points.
+    """Return the number (n,) of the node of a grid (rows, columns, 3) nearest to each of consecutive points (n, 3).
 
     Each search starts from the node of the previous point; if the points are too far apart, all nodes are tried.
-
-    Shapes: `nodes` (rows, columns, 3), `points` (n, 3).
     """
-    columns = nodes.shape[1]
+    rows, columns = nodes.shape[0], nodes.shape[1]
     home = np.zeros(len(points), dtype=np.int32)
     row, column = 0, 0
     for p in range(len(points)):
@@ -54,7 +39,12 @@ def homes(nodes: Any, points: Any) -> Any:
             jump2 += (points[p, k] - points[p - 1, k]) ** 2 if p > 0 else 0.0
             reach2 += (nodes[row, (column + 1) % columns, k] - nodes[row, column, k]) ** 2
         if p == 0 or jump2 > reach2:
-            row, column = _nearest(nodes, points[p])
+            nearest2 = np.inf
+            for i in range(rows):
+                for j in range(columns):
+                    away2 = _away2(nodes, points[p], i, j)
+                    if away2 < nearest2:
+                        nearest2, row, column = away2, i, j
         row, column = _downhill(nodes, points[p], row, column)
         home[p] = row * columns + column
     return home
@@ -67,18 +57,6 @@ def _away2(nodes: Any, point: Any, row: int, column: int) -> float:
     for k in range(3):
         total += (nodes[row, column, k] - point[k]) ** 2
     return total
-
-
-@njit(cache=True)
-def _nearest(nodes: Any, point: Any) -> tuple[int, int]:
-    """Return row and column of the node nearest to a point, by trying all nodes."""
-    best, at = np.inf, (0, 0)
-    for row in range(nodes.shape[0]):
-        for column in range(nodes.shape[1]):
-            away2 = _away2(nodes, point, row, column)
-            if away2 < best:
-                best, at = away2, (row, column)
-    return at
 
 
 @njit(cache=True)
@@ -123,20 +101,14 @@ def _plane(corners: Any, frame: Any) -> float:
         for k in range(3):
             away2 += (corners[corner, k] - frame[0, k]) ** 2
         reach2 = max(reach2, away2)
-    _scale(frame[1])
-    share = frame[2, 0] * frame[1, 0] + frame[2, 1] * frame[1, 1] + frame[2, 2] * frame[1, 2]
-    for k in range(3):
-        frame[2, k] -= share * frame[1, k]
-    _scale(frame[2])
+    for i in range(1, 3):
+        share = frame[2, 0] * frame[1, 0] + frame[2, 1] * frame[1, 1] + frame[2, 2] * frame[1, 2] if i == 2 else 0.0
+        for k in range(3):
+            frame[i, k] -= share * frame[1, k]
+        length = np.sqrt(frame[i, 0] ** 2 + frame[i, 1] ** 2 + frame[i, 2] ** 2)
+        for k in range(3):
+            frame[i, k] /= length
     return np.sqrt(reach2)
-
-
-@njit(cache=True)
-def _scale(vector: Any) -> None:
-    """Normalise a vector (3,) in place."""
-    length = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
-    for k in range(3):
-        vector[k] /= length
 
 
 @njit(cache=True)
@@ -173,48 +145,34 @@ def _is_under(x: float, y: float, flat: Any) -> bool:
 
 
 @njit(cache=True)
-def _share_under(quad: int, corners: Any, frame: Any, flat: Any, samples: int) -> float:
-    """Return the fraction of a cell's sample points that lie under wires."""
-    hits = 0
-    at = np.zeros((4, 2))
-    for corner in range(4):
-        for k in range(3):
-            off = corners[corner, k] - frame[0, k]
-            at[corner, 0] += off * frame[1, k]
-            at[corner, 1] += off * frame[2, k]
-    for sample in range(samples * samples):
-        # R2 sequence (Roberts 2018), with an offset per cell from a sequence of the same kind.
-        u = (0.5 + 0.7548776662466927 * sample + 0.5698402909980532 * quad) % 1.0
-        v = (0.5 + 0.5698402909980532 * sample + 0.3247179572447460 * quad) % 1.0
-        a, b, c, d = (1 - u) * (1 - v), (1 - u) * v, u * (1 - v), u * v
-        x = a * at[0, 0] + b * at[1, 0] + c * at[2, 0] + d * at[3, 0]
-        y = a * at[0, 1] + b * at[1, 1] + c * at[2, 1] + d * at[3, 1]
-        hits += _is_under(x, y, flat)
-    return hits / (samples * samples)
-
-
-@njit(cache=True)
-def _row_fractions(
-    row: int, nodes: Any, starts: Any, ends: Any, radius: Any, first: Any, samples: int, result: Any
-) -> None:
-    """Write the covered fractions of one row of cells into `result`."""
+def _fractions(nodes: Any, starts: Any, ends: Any, radius: Any, first: Any, samples: int) -> Any:
+    """Return the covered fractions (rows - 1, columns) of all cells."""
     rows, columns = nodes.shape[0], nodes.shape[1]
+    result = np.zeros((rows - 1, columns))
     near, flat = np.zeros(4096, dtype=np.int32), np.zeros((4096, 6))
-    corners, frame = np.zeros((4, 3)), np.zeros((3, 3))
-    for column in range(columns):
+    corners, frame, at = np.zeros((4, 3)), np.zeros((3, 3)), np.zeros((4, 2))
+    for quad in range((rows - 1) * columns):
+        row, column = quad // columns, quad % columns
         for k in range(3):
             corners[0, k], corners[1, k] = nodes[row, column, k], nodes[row, (column + 1) % columns, k]
             corners[2, k], corners[3, k] = nodes[row + 1, column, k], nodes[row + 1, (column + 1) % columns, k]
         reach = _plane(corners, frame)
         n_near = _gather(first, row, column, rows, columns, near)
         n_flat = _flatten(frame, reach, starts, ends, radius, near[:n_near], flat)
-        result[row, column] = _share_under(row * columns + column, corners, frame, flat[:n_flat], samples)
-
-
-@njit(cache=True)
-def _fractions(nodes: Any, starts: Any, ends: Any, radius: Any, first: Any, samples: int) -> Any:
-    """Return the covered fractions (rows - 1, columns) of all cells."""
-    result = np.zeros((nodes.shape[0] - 1, nodes.shape[1]))
-    for row in range(len(result)):
-        _row_fractions(row, nodes, starts, ends, radius, first, samples, result)
+        at[:] = 0.0
+        for corner in range(4):
+            for k in range(3):
+                off = corners[corner, k] - frame[0, k]
+                at[corner, 0] += off * frame[1, k]
+                at[corner, 1] += off * frame[2, k]
+        hits = 0
+        for sample in range(samples * samples):
+            # R2 sequence (Roberts 2018), with an offset per cell from a sequence of the same kind.
+            u = (0.5 + 0.7548776662466927 * sample + 0.5698402909980532 * quad) % 1.0
+            v = (0.5 + 0.5698402909980532 * sample + 0.3247179572447460 * quad) % 1.0
+            a, b, c, d = (1 - u) * (1 - v), (1 - u) * v, u * (1 - v), u * v
+            x = a * at[0, 0] + b * at[1, 0] + c * at[2, 0] + d * at[3, 0]
+            y = a * at[0, 1] + b * at[1, 1] + c * at[2, 1] + d * at[3, 1]
+            hits += _is_under(x, y, flat[:n_flat])
+        result[row, column] = hits / (samples * samples)
     return result

@@ -51,8 +51,7 @@ def _closed_lengths(rows: Any) -> Any:
 
 def arc_length(points: Floats) -> Floats:
     """Return the cumulative length (n,) of a polyline (n, 3), starting at 0."""
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
 
 
 def interpolate(abscissa: Floats, values: Floats, wanted: Floats) -> Floats:
@@ -80,9 +79,7 @@ def tangents(points: Floats) -> Floats:
 def parallel_frames(points: Floats) -> Floats:
     """Return rotation-minimising frames (n, 3, 3) of a polyline: rows tangent, normal, binormal (right-handed).
 
-    References
-    ----------
-    Wang, Juettler, Zheng and Liu 2008, ACM Trans. Graph. 27(1):2, table I: double reflection.
+    They are found by double reflection (Wang, Juettler, Zheng and Liu 2008, ACM Trans. Graph. 27(1):2, table I).
     """
     tangent = tangents(points)
     points = np.array(points, dtype=np.float64)  # a writable copy: numba compiles separate code for read-only arrays
@@ -130,38 +127,29 @@ def curvature_and_torsion(points: Floats, reach: float) -> tuple[Floats, Floats]
     """Return curvature |a x b| / |a|^3 and torsion (a x b) . c / |a x b|^2, both (n,), of evenly spaced points (n, 3).
 
     a, b and c are the first three derivatives of a quartic least-squares fit through the points within `reach` along
-    the curve. The torsion of a straight piece, where it is undefined, is set to 0.
-
-    References
-    ----------
-    Savitzky and Golay 1964, Anal. Chem. 36:1627.
+    the curve (Savitzky and Golay 1964, Anal. Chem. 36:1627). The torsion of a straight piece, where it is undefined, is
+    set to 0.
     """
     step = float(arc_length(points)[-1]) / (len(points) - 1)
     window = min(2 * max(3, round(reach / step)) + 1, len(points) - 1 + len(points) % 2)
-    a, b, c = _derivatives(points, window, step)
+    # scipy.signal, which has the same filter, is not used because its import takes a second. The first and the last fit
+    # also apply to the points between them and the ends.
+    half, order = window // 2, 4
+    fit = np.linalg.pinv(np.vander(np.arange(-half, half + 1.0) / half, order + 1, increasing=True))
+    start = np.clip(np.arange(len(points)) - half, 0, len(points) - window)
+    at = (np.arange(len(points)) - start - half)[:, None] / half
+    power = (np.lib.stride_tricks.sliding_window_view(points, window, axis=0) @ fit.T)[start]
+    derivatives = []
+    for k in (1, 2, 3):
+        power = power[..., 1:] * np.arange(1.0, order + 2 - k)
+        value = np.polynomial.polynomial.polyval(at, np.moveaxis(power, -1, 0), tensor=False)
+        derivatives.append(value / (half * step) ** k)
+    a, b, c = derivatives
     cross = np.cross(a, b)
     size = np.linalg.norm(cross, axis=1)
     is_bent = size > 1e-6
     torsion = np.einsum("ij,ij->i", cross, c) / np.where(is_bent, size, 1.0) ** 2
     return size / np.linalg.norm(a, axis=1) ** 3, np.where(is_bent, torsion, 0.0)
-
-
-def _derivatives(points: Floats, window: int, step: float) -> list[Floats]:
-    """Return the first three derivatives (n, 3) of quartic fits through `window` points each, an odd number.
-
-    The first and the last fit also apply to the points between them and the ends. scipy.signal, which has the same
-    filter, is not used because its import takes a second.
-    """
-    half, order = window // 2, 4
-    fit = np.linalg.pinv(np.vander(np.arange(-half, half + 1.0) / half, order + 1, increasing=True))
-    start = np.clip(np.arange(len(points)) - half, 0, len(points) - window)
-    at = (np.arange(len(points)) - start - half)[:, None] / half
-    of_windows = np.lib.stride_tricks.sliding_window_view(points, window, axis=0) @ fit.T
-    found, power = [], of_windows[start]
-    for k in (1, 2, 3):
-        power = power[..., 1:] * np.arange(1.0, order + 2 - k)
-        found.append(np.polynomial.polynomial.polyval(at, np.moveaxis(power, -1, 0), tensor=False) / (half * step) ** k)
-    return found
 
 
 def directions(n: int) -> Floats:
@@ -212,14 +200,7 @@ def lowpass(values: Floats, n_waves: float) -> Floats:
 
 
 def roughness(n: int, order: int, strength: Floats | float = 1.0) -> csc_matrix:
-    """Return the matrix (n, n) of the weighted sum of squared differences along n samples.
-
-    Parameters
-    ----------
-    n : number of samples.
-    order : order of the differences.
-    strength : float or (n,); weight of the differences, possibly for every sample.
-    """
+    """Return the matrix (n, n) of the sum of squared differences along n samples, weighted with `strength`."""
     difference = csc_matrix(eye(n))
     for k in range(order):
         difference = csc_matrix(diags([-1.0, 1.0], [0, 1], shape=(n - k - 1, n - k)) @ difference)
@@ -228,22 +209,12 @@ def roughness(n: int, order: int, strength: Floats | float = 1.0) -> csc_matrix:
 
 
 def smooth(values: Floats, weight: Floats, strength: Floats | float, order: int = 2) -> Floats:
-    """Smooth samples with the Whittaker method: minimise sum w |x - v|^2 + strength |difference of `order` of x|^2.
+    """Smooth samples v (n, ...): minimise sum w |x - v|^2 + strength |difference of `order` of x|^2.
 
-    Parameters
-    ----------
-    values : (n,) or (n, d); samples v.
-    weight : (n,); weights w.
-    strength : float or (n,); weight of the differences, possibly for every sample.
-    order : order of the differences.
-
-    References
-    ----------
-    Eilers 2003, Anal. Chem. 75:3631, eq. 5.
+    Weights w are (n,), and the strength may differ between samples (Whittaker; Eilers 2003, Anal. Chem. 75:3631).
     """
-    n = len(values)
-    if n <= order:
+    if len(values) <= order:
         return values
-    matrix = diags(weight) + roughness(n, order, strength)
+    matrix = diags(weight) + roughness(len(values), order, strength)
     right = values * (weight if values.ndim == 1 else weight[:, None])
     return np.asarray(spsolve(csc_matrix(matrix), right)).reshape(values.shape)

@@ -12,13 +12,9 @@ MOST_CHARACTERS = 22
 
 
 def text_rows(words: list[str], numbers: Ints, decimals: int) -> bytes:
-    """Return one line of text per row of numbers, without a line break at the end.
+    """Return one line of text per row of numbers (n, k), without a line break at the end.
 
-    Parameters
-    ----------
-    words : k + 1 texts; text before, between and after the numbers of a row.
-    numbers : (n, k); numbers, multiplied by 10^decimals.
-    decimals : digits after the point; 0: no point.
+    The k + 1 words stand before, between and after the numbers of a row, which are multiplied by 10^decimals.
     """
     parts = [word.encode() for word in [*words[:-1], words[-1] + "\n"]]
     starts = np.cumsum([0, *map(len, parts)])

@@ -10,88 +10,66 @@ from numba.core import event
 from vstent.children import environment
 
 
-@contextmanager
-def telling(tell: Callable[[], None], *, helper: Sequence[str] = ()) -> Iterator[None]:
-    """Call `tell` once when a kernel has to be compiled because numba's cache does not hold it.
+class _Listener(event.Listener):
+    """Calls a function when a compilation begins."""
 
-    Parameters
-    ----------
-    tell : called at the first compilation.
-    helper : command of a second process that compiles further kernels until this block ends. Threads of one process
-        cannot compile at the same time, but this process uses whatever the helper has put in numba's cache by then.
-    """
-    once = _Once(tell, tuple(helper))
-    try:
-        with event.install_listener("numba:compile", once):
-            yield
-    finally:
-        once.stop()
+    def __init__(self, call: Callable[[], None]) -> None:
+        """Store the function."""
+        self._call = call
+
+    def on_start(self, event: event.Event) -> None:
+        """Call the function."""
+        self._call()
+
+    def on_end(self, event: event.Event) -> None:
+        """Do nothing."""
 
 
-def kept(call: Callable[[], None], command: Sequence[str]) -> None:
-    """Make sure that the kernels which `call` runs are loaded from numba's cache.
-
-    If one is missing, another process compiles it. Where the cache cannot be written, this process compiles at the next
-    call.
-
-    Parameters
-    ----------
-    call : runs the kernels.
-    command : command of a process that compiles them.
-    """
-    try:
-        with event.install_listener("numba:compile", _Refusal()):
-            call()
-    except _Unkept:
-        subprocess.run(command, env=environment(), stdin=subprocess.DEVNULL, capture_output=True, check=False)
-
-
-class _Unkept(Exception):
+class _NotCachedError(Exception):
     """A kernel is missing from numba's cache and would be compiled."""
 
 
-class _Refusal(event.Listener):
-    """Prevents compilation in this thread."""
+@contextmanager
+def reporting_compilation(report: Callable[[], None], *, helper: Sequence[str] = ()) -> Iterator[None]:
+    """Call `report` once when a kernel has to be compiled because numba's cache does not hold it.
 
-    def __init__(self) -> None:
-        """Store the present thread."""
-        self._thread = threading.get_ident()
+    Then also start the command `helper`, a second process that compiles further kernels until this block ends. Threads
+    of one process cannot compile at the same time, but this process uses whatever the helper has put in numba's cache.
+    """
+    calls = [report]
+    processes: list[subprocess.Popen[bytes]] = []
 
-    def on_start(self, event: event.Event) -> None:
-        """Raise `_Unkept` in this thread."""
-        if threading.get_ident() == self._thread:
-            raise _Unkept
-
-    def on_end(self, event: event.Event) -> None:
-        """Do nothing."""
-
-
-class _Once(event.Listener):
-    """Reports the first compilation and starts the helper process."""
-
-    def __init__(self, tell: Callable[[], None], command: tuple[str, ...]) -> None:
-        """Store the callback and the command."""
-        self._tell: Callable[[], None] | None = tell
-        self._command = command
-        self._helper: subprocess.Popen[bytes] | None = None
-
-    def on_start(self, event: event.Event) -> None:
-        """Call the callback and start the helper, the first time."""
-        tell, self._tell = self._tell, None
-        if tell is None:
+    def begin() -> None:
+        if not calls:
             return
-        tell()
-        if self._command:
+        calls.pop()()
+        if helper:
             silent = subprocess.DEVNULL
-            self._helper = subprocess.Popen(
-                self._command, env=environment(), stdin=silent, stdout=silent, stderr=silent
-            )
+            processes.append(subprocess.Popen(helper, env=environment(), stdin=silent, stdout=silent, stderr=silent))
 
-    def on_end(self, event: event.Event) -> None:
-        """Do nothing."""
+    try:
+        with event.install_listener("numba:compile", _Listener(begin)):
+            yield
+    finally:
+        for process in processes:  # the kernels that it has finished stay in the cache
+            process.terminate()
+            process.wait()
 
-    def stop(self) -> None:
-        """Stop the helper; the kernels that it has finished stay in the cache."""
-        if self._helper is not None:
-            self._helper.terminate()
-            self._helper.wait()
+
+def ensure_cached(call: Callable[[], None], command: Sequence[str]) -> None:
+    """Make sure that the kernels which `call` runs are loaded from numba's cache.
+
+    If one is missing, another process compiles it by running `command`. Where the cache cannot be written, this process
+    compiles at the next call.
+    """
+    thread = threading.get_ident()
+
+    def refuse() -> None:
+        if threading.get_ident() == thread:
+            raise _NotCachedError
+
+    try:
+        with event.install_listener("numba:compile", _Listener(refuse)):
+            call()
+    except _NotCachedError:
+        subprocess.run(command, env=environment(), stdin=subprocess.DEVNULL, capture_output=True, check=False)

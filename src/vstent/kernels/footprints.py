@@ -10,37 +10,23 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
-PARTS_PER_PIXEL = 1.0
-"""Number of parts of a cell along a detector pixel, at least."""
 MAX_PARTS = 12
 """Largest number of parts along an edge of a cell."""
 
 
 @njit(cache=True)
-def _parts(spacing: float, magnification: float, pixel: float) -> int:
-    """Return the number of parts along an edge of a cell."""
-    return max(1, min(MAX_PARTS, int(np.ceil(PARTS_PER_PIXEL * spacing * magnification / pixel))))
-
-
-@njit(cache=True)
-def _window(seen: Any, spacing: float, geometry: Any) -> tuple[int, int, int, int]:
-    """Return first row, first column, rows and columns of a window that holds the footprint of a cell."""
+def _entries(seen: Any, spacing: float, axes: Any, geometry: Any, shape: Any) -> tuple[Any, Any]:
+    """Return the numbers and weights of the pixels in the footprint of a cell."""
     pixel, detector, isocenter = geometry[0], geometry[1], geometry[2]
     reach = 0.5 * np.sqrt(3.0) * spacing
     nearest = detector / (isocenter + seen[2] - reach) / pixel
     middle = detector / (isocenter + seen[2]) / pixel
     row, column = geometry[3] - seen[1] * middle, geometry[4] + seen[0] * middle
     aside = max(abs(seen[0]), abs(seen[1])) * (nearest - middle)
-    half = reach * nearest + aside + 1.5
-    i, j = int(np.floor(row - half)), int(np.floor(column - half))
-    return i, j, int(np.ceil(row + half)) - i + 1, int(np.ceil(column + half)) - j + 1
-
-
-@njit(cache=True)
-def _footprint(seen: Any, spacing: float, axes: Any, geometry: Any, first: Any, out: Any) -> None:
-    """Add the footprint of a cell to a window of zeros whose first row and column are `first`."""
-    pixel, detector, isocenter = geometry[0], geometry[1], geometry[2]
-    n = _parts(spacing, detector / (isocenter + seen[2]), pixel)
+    margin = reach * nearest + aside + 1.5
+    first_row, first_column = int(np.floor(row - margin)), int(np.floor(column - margin))
+    out = np.zeros((int(np.ceil(row + margin)) - first_row + 1, int(np.ceil(column + margin)) - first_column + 1))
+    n = max(1, min(MAX_PARTS, int(np.ceil(spacing * (detector / (isocenter + seen[2])) / pixel))))
     step = spacing / n
     for k in range(n * n * n):
         x = (k // (n * n) + 0.5) * step - 0.5 * spacing
@@ -53,28 +39,20 @@ def _footprint(seen: Any, spacing: float, axes: Any, geometry: Any, first: Any, 
         # A ray element dr at a distance r is dV / (r^2 dOmega); a pixel is seen under dOmega = A cos^3 / detector^2.
         weight = step**3 * scale * scale * np.sqrt(1.0 + (right * right + up * up) / (depth * depth))
         half = 0.5 * step * scale
-        top, left = (
-            geometry[3] - up * scale - first[0] - half + 0.5,
-            geometry[4] + right * scale - first[1] - half + 0.5,
-        )
+        top = geometry[3] - up * scale - first_row - half + 0.5
+        left = geometry[4] + right * scale - first_column - half + 0.5
         weight /= 4.0 * half * half
         for i in range(int(np.floor(top)), int(np.floor(top + 2 * half)) + 1):
             high = min(top + 2 * half, i + 1.0) - max(top, float(i))
             for j in range(int(np.floor(left)), int(np.floor(left + 2 * half)) + 1):
                 out[i, j] += weight * high * (min(left + 2 * half, j + 1.0) - max(left, float(j)))
-
-
-@njit(cache=True)
-def _inside(out: Any, first: Any, shape: Any, rows: Any, values: Any) -> int:
-    """Write pixel numbers and weights of a window that lie on the detector; return their number."""
-    n = 0
-    for i in range(max(0, -first[0]), min(out.shape[0], shape[0] - first[0])):
-        for j in range(max(0, -first[1]), min(out.shape[1], shape[1] - first[1])):
+    pixels, weights, n = np.zeros(out.size, np.int32), np.zeros(out.size, np.float32), 0
+    for i in range(max(0, -first_row), min(out.shape[0], shape[0] - first_row)):
+        for j in range(max(0, -first_column), min(out.shape[1], shape[1] - first_column)):
             if out[i, j] > 0.0:
-                if len(rows):
-                    rows[n], values[n] = (first[0] + i) * shape[1] + first[1] + j, out[i, j]
+                pixels[n], weights[n] = (first_row + i) * shape[1] + first_column + j, out[i, j]
                 n += 1
-    return n
+    return pixels[:n], weights[:n]
 
 
 @njit(cache=True, parallel=True)
@@ -83,11 +61,11 @@ def footprints(seen: Any, spacing: Any, axes: Any, geometry: Any, shape: Any) ->
 
     Parameters
     ----------
-    seen : (n, 3); cell centers relative to the isocenter, mm: right, up, toward the detector.
-    spacing : (n,); edges of the cells, mm.
-    axes : (3, 3); right, up and toward the detector as rows in the axes of the cells.
-    geometry : (5,); pixel, source-detector and source-isocenter distance in mm, row and column of the isocenter.
-    shape : (2,); rows and columns of the detector.
+    seen : (n, 3) cell centers relative to the isocenter, mm: right, up, toward the detector.
+    spacing : (n,) edges of the cells, mm.
+    axes : (3, 3) right, up and toward the detector as rows in the axes of the cells.
+    geometry : (5,) pixel, source-detector and source-isocenter distance in mm, row and column of the isocenter.
+    shape : (2,) rows and columns of the detector.
 
     Returns
     -------
@@ -96,18 +74,12 @@ def footprints(seen: Any, spacing: Any, axes: Any, geometry: Any, shape: Any) ->
     weights : (m,) float32; length in mm over which a ray to the pixel crosses the cell, averaged over the pixel.
     """
     starts = np.zeros(len(seen) + 1, np.int64)
-    none, nothing = np.zeros(0, np.int32), np.zeros(0, np.float32)
     for c in prange(len(seen)):
-        i, j, rows, columns = _window(seen[c], spacing[c], geometry)
-        out, first = np.zeros((rows, columns)), np.array([i, j])
-        _footprint(seen[c], spacing[c], axes, geometry, first, out)
-        starts[c + 1] = _inside(out, first, shape, none, nothing)
+        starts[c + 1] = len(_entries(seen[c], spacing[c], axes, geometry, shape)[0])
     starts = np.cumsum(starts)
     pixels, weights = np.zeros(starts[-1], np.int32), np.zeros(starts[-1], np.float32)
     for c in prange(len(seen)):
         if starts[c + 1] > starts[c]:
-            i, j, rows, columns = _window(seen[c], spacing[c], geometry)
-            out, first = np.zeros((rows, columns)), np.array([i, j])
-            _footprint(seen[c], spacing[c], axes, geometry, first, out)
-            _inside(out, first, shape, pixels[starts[c] : starts[c + 1]], weights[starts[c] : starts[c + 1]])
+            entries = _entries(seen[c], spacing[c], axes, geometry, shape)
+            pixels[starts[c] : starts[c + 1]], weights[starts[c] : starts[c + 1]] = entries
     return starts, pixels, weights

@@ -7,24 +7,10 @@ from vstent.kernels.arrays import Floats, Ints
 
 
 def isosurface(field: NDArray[np.float32], level: float) -> tuple[Floats, Ints]:
-    """Return the triangles where a field crosses a level.
+    """Return vertices (n, 3) in index units and faces (m, 3), counter-clockwise seen from the low side.
 
-    Vertices lie on grid edges and are found by linear interpolation. The surface is open where it meets the border of
-    the grid.
-
-    Parameters
-    ----------
-    field : (i, j, k) float32; field.
-    level : level.
-
-    Returns
-    -------
-    vertices : (n, 3); vertices in index units.
-    faces : (m, 3); triangles, counter-clockwise seen from the low side.
-
-    References
-    ----------
-    Schroeder, Maynard and Geveci 2015, IEEE LDAV: flying edges.
+    Vertices lie on grid edges and are found by linear interpolation (flying edges: Schroeder, Maynard and Geveci 2015,
+    IEEE LDAV). The surface is open where it meets the border of the grid.
     """
     from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
     from vtkmodules.vtkCommonDataModel import vtkImageData

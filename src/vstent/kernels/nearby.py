@@ -32,15 +32,7 @@ class _Boxes(NamedTuple):
 
 
 def sums(nodes: Floats, points: Floats, values: Floats, reach: float) -> Floats:
-    """Return the weighted sums (n, k) of the values of points around every node.
-
-    Parameters
-    ----------
-    nodes : (n, 3); nodes.
-    points : (p, 3); points.
-    values : (p, k); values of the points.
-    reach : distance at which the weight becomes zero.
-    """
+    """Return the sums (n, k) of values (p, k) at points (p, 3) around nodes (n, 3), with weight zero beyond `reach`."""
     boxes, order = _boxed(nodes, reach)
     result = np.zeros((len(order), values.shape[1]))
     result[order] = _sums(boxes, np.array(points), np.array(values), reach)
@@ -48,16 +40,9 @@ def sums(nodes: Floats, points: Floats, values: Floats, reach: float) -> Floats:
 
 
 def areas(nodes: Floats, corners: Floats, spacing: float, reach: float) -> Floats:
-    """Return the weighted area (n,) of triangles around every node.
+    """Return the weighted area (n,) of triangles (m, 3, 3) around nodes (n, 3), with weight zero beyond `reach`.
 
     A triangle is quartered until its edges are at most `spacing` long. Each part has the weight of its centroid.
-
-    Parameters
-    ----------
-    nodes : (n, 3); nodes.
-    corners : (m, 3, 3); triangles.
-    spacing : maximum edge of a part.
-    reach : distance at which the weight becomes zero.
     """
     boxes, order = _boxed(nodes, reach)
     result = np.zeros(len(order))
@@ -126,12 +111,17 @@ def _areas(boxes: Any, corners: Any, spacing: float, reach: float) -> Any:
         depth = 1
         while depth > 0:
             depth -= 1
-            if _longest_edge(stack[depth]) > spacing:
+            t, longest2, cross2 = stack[depth], 0.0, 0.0
+            for k in range(3):
+                i, j = (k + 1) % 3, (k + 2) % 3
+                longest2 = max(longest2, (t[k, 0] - t[i, 0]) ** 2 + (t[k, 1] - t[i, 1]) ** 2 + (t[k, 2] - t[i, 2]) ** 2)
+                cross2 += ((t[1, i] - t[0, i]) * (t[2, j] - t[0, j]) - (t[1, j] - t[0, j]) * (t[2, i] - t[0, i])) ** 2
+            if np.sqrt(longest2) > spacing:
                 _quarter(stack, depth)
                 depth += 4
                 continue
-            area = _area(stack[depth])
-            x, y, z = _middle(stack[depth])
+            area = 0.5 * np.sqrt(cross2)
+            x, y, z = _middle(t)
             for m in range(size):
                 away2 = (near[0, m] - x) ** 2 + (near[1, m] - y) ** 2 + (near[2, m] - z) ** 2
                 left = max(1.0 - away2 * per_reach2, 0.0)
@@ -172,26 +162,6 @@ def _middle(t: Any) -> tuple[float, float, float]:
         (t[0, 1] + t[1, 1] + t[2, 1]) / 3,
         (t[0, 2] + t[1, 2] + t[2, 2]) / 3,
     )
-
-
-@njit(cache=True)
-def _longest_edge(t: Any) -> float:
-    """Return the length of the longest edge of a triangle."""
-    most = 0.0
-    for i in range(3):
-        j = (i + 1) % 3
-        most = max(most, (t[i, 0] - t[j, 0]) ** 2 + (t[i, 1] - t[j, 1]) ** 2 + (t[i, 2] - t[j, 2]) ** 2)
-    return np.sqrt(most)
-
-
-@njit(cache=True)
-def _area(t: Any) -> float:
-    """Return the area of a triangle."""
-    total = 0.0
-    for k in range(3):
-        i, j = (k + 1) % 3, (k + 2) % 3
-        total += ((t[1, i] - t[0, i]) * (t[2, j] - t[0, j]) - (t[1, j] - t[0, j]) * (t[2, i] - t[0, i])) ** 2
-    return 0.5 * np.sqrt(total)
 
 
 @njit(cache=True)

@@ -21,11 +21,7 @@ from numba import njit
 from vstent.kernels.arrays import Floats, Ints
 
 _WAVES: Final = 6
-"""Number of moves of a row in the coarse problem: 1, cos, sin, along and around."""
-_BAND: Final = 2 * _WAVES
-"""Bandwidth of its matrix: a row and the next."""
-
-
+"""Number of moves of a row in the coarse problem: 1, cos, sin, along and around. Its bandwidth is two rows."""
 INERTIA: Final = 0.001
 """Initial damping: squared weight of a crossing's move relative to its row.
 
@@ -210,37 +206,18 @@ def _multiply(net: Any, weights: Any, inertia: float, ends: Any, slopes: Any, x:
 
 
 @njit(cache=True, nogil=True)
-def _diagonal(net: Any, weights: Any, inertia: float, ends: Any, slopes: Any) -> Any:
-    """Return the inverse of the normal matrix's diagonal (c, 2)."""
-    inverse = np.zeros((len(net.line), 2))
-    for p in range(len(slopes)):
-        for k in range(2):
-            inverse[ends[0, p], k] += slopes[p, k] ** 2
-            inverse[ends[1, p], k] += slopes[p, 2 + k] ** 2
-    # Each crossing is on two wires and in three triples (1, -2, 1) of each: 2 (1 + 4 + 1) = 12.
-    rest = weights.resistance**2 + inertia + 12 * weights.stiffness**2
-    for c in range(len(inverse)):
-        for k in range(2):
-            inverse[c, k] = 1 / (inverse[c, k] + rest + 2 * k * weights.crowding**2)
-    return inverse
-
-
-@njit(cache=True, nogil=True)
 def _stretching(net: Any, slopes: Any, waves: Any) -> Any:
-    """Return the pieces' part of the normal matrix on moves of whole rows: (l, BAND, BAND), lower, a row and the next.
-
-    It does not depend on the damping.
-    """
+    """Return the pieces' part of the normal matrix on moves of whole rows: (l, 12, 12), lower, a row and the next."""
     line = net.line
-    blocks = np.zeros((int(line[-1]) + 1, _BAND, _BAND))
-    g = np.zeros(_BAND)
+    blocks = np.zeros((int(line[-1]) + 1, 2 * _WAVES, 2 * _WAVES))
+    g = np.zeros(2 * _WAVES)
     for p in range(net.ends.shape[1]):
         a, b = net.ends[0, p], net.ends[1, p]
         for w in range(3):
             g[w], g[3 + w] = slopes[p, 0] * waves[a, w], slopes[p, 1] * waves[a, w]
             g[6 + w], g[9 + w] = slopes[p, 2] * waves[b, w], slopes[p, 3] * waves[b, w]
         block = blocks[line[a]]
-        for i in range(_BAND):
+        for i in range(2 * _WAVES):
             for j in range(i + 1):
                 block[i, j] += g[i] * g[j]
     return blocks
@@ -248,7 +225,10 @@ def _stretching(net: Any, slopes: Any, waves: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def _coarse(net: Any, weights: Any, inertia: float, stretching: Any, waves: Any) -> Any:
-    """Return the banded Cholesky factor (n, BAND), lower form, of the normal matrix on moves of whole rows."""
+    """Return the banded Cholesky factor of the normal matrix on moves of whole rows.
+
+    Entry (i, i - k) is in place (i, k) of (n, 12); the diagonal is inverted.
+    """
     line, damp, crowd = net.line, weights.resistance**2, weights.crowding**2
     blocks = stretching.copy()
     for c in range(len(line)):
@@ -261,18 +241,12 @@ def _coarse(net: Any, weights: Any, inertia: float, stretching: Any, waves: Any)
                 block[3 + w, 3 + v] += (damp + inertia) * both + crowd * apart
         if line[c] == weights.held:
             block[0, 0] += 1.0
-    band = np.zeros((len(blocks) * _WAVES, _BAND))
+    n, width = len(blocks) * _WAVES, 2 * _WAVES
+    band = np.zeros((n, width))
     for row in range(len(blocks)):
-        for i in range(_BAND if row < len(blocks) - 1 else _WAVES):
+        for i in range(width if row < len(blocks) - 1 else _WAVES):
             for j in range(i + 1):
                 band[row * _WAVES + i, i - j] += blocks[row, i, j]
-    return _cholesky(band)
-
-
-@njit(cache=True, nogil=True)
-def _cholesky(band: Any) -> Any:
-    """Factorise a symmetric band matrix in place: entry (i, i - k) is band[i, k]; the diagonal becomes its inverse."""
-    n, width = band.shape
     for i in range(n):
         for k in range(min(i, width - 1), -1, -1):
             j = i - k
@@ -284,20 +258,6 @@ def _cholesky(band: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _solve(factor: Any, right: Any) -> None:
-    """Solve in place with a factor from `_cholesky`."""
-    n, width = factor.shape
-    for i in range(n):
-        for k in range(1, min(i, width - 1) + 1):
-            right[i] -= factor[i, k] * right[i - k]
-        right[i] *= factor[i, 0]
-    for i in range(n - 1, -1, -1):
-        right[i] *= factor[i, 0]
-        for k in range(1, min(i, width - 1) + 1):
-            right[i - k] -= factor[i, k] * right[i]
-
-
-@njit(cache=True, nogil=True)
 def _precondition(inverse: Any, factor: Any, line: Any, waves: Any, residual: Any, result: Any) -> None:
     """Write the product of the preconditioner and the residual (c, 2)."""
     rows = np.zeros((len(factor) // _WAVES, 2, 3))
@@ -305,7 +265,15 @@ def _precondition(inverse: Any, factor: Any, line: Any, waves: Any, residual: An
         for k in range(2):
             for w in range(3):
                 rows[line[c], k, w] += waves[c, w] * residual[c, k]
-    _solve(factor, rows.reshape(-1))
+    right, width = rows.reshape(-1), factor.shape[1]
+    for i in range(len(right)):
+        for k in range(1, min(i, width - 1) + 1):
+            right[i] -= factor[i, k] * right[i - k]
+        right[i] *= factor[i, 0]
+    for i in range(len(right) - 1, -1, -1):
+        right[i] *= factor[i, 0]
+        for k in range(1, min(i, width - 1) + 1):
+            right[i - k] -= factor[i, k] * right[i]
     for c in range(len(line)):
         for k in range(2):
             result[c, k] = inverse[c, k] * residual[c, k]
@@ -343,7 +311,16 @@ def _step(net: Any, weights: Any, inertia: float, coarse: Any, slopes: Any, resi
     `coarse` is (factor, waves) of the coarse part, `slopes` (ends, slopes) of pieces and cells.
     """
     n, (factor, waves), (ends, slopes) = len(net.line), coarse, slopes
-    inverse = _diagonal(net, weights, inertia, ends, slopes)
+    inverse = np.zeros((n, 2))  # of the normal matrix's diagonal
+    for p in range(len(slopes)):
+        for k in range(2):
+            inverse[ends[0, p], k] += slopes[p, k] ** 2
+            inverse[ends[1, p], k] += slopes[p, 2 + k] ** 2
+    # Each crossing is on two wires and in three triples (1, -2, 1) of each: 2 (1 + 4 + 1) = 12.
+    rest = weights.resistance**2 + inertia + 12 * weights.stiffness**2
+    for c in range(n):
+        for k in range(2):
+            inverse[c, k] = 1 / (inverse[c, k] + rest + 2 * k * weights.crowding**2)
     move, way, ready, image = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2))
     residual, goal, before = residual.copy(), 0.0, np.inf
     for _ in range(ROUNDS):

@@ -15,15 +15,7 @@ from vstent.kernels.arrays import Floats, Ints
 
 @njit(cache=True, nogil=True)
 def paint_triangles(screen: Floats, colours: Floats, faces: Ints, depth: Floats, image: Floats) -> None:
-    """Paint opaque triangles; the nearer one is visible.
-
-    Parameters
-    ----------
-    screen : (n, 3); vertices in screen coordinates.
-    colours : (n, 3); colour of every vertex.
-    faces : (m, 3); triangles.
-    depth, image : changed in place.
-    """
+    """Paint opaque triangles (m, 3) of vertices (n, 3) with colours (n, 3) in place; the nearer one is visible."""
     height, width = depth.shape
     for f in range(len(faces)):
         i, j, k = _turned(screen, faces[f, 0], faces[f, 1], faces[f, 2])
@@ -52,16 +44,10 @@ def paint_triangles(screen: Floats, colours: Floats, faces: Ints, depth: Floats,
 def paint_wires(
     screen: Floats, starts: Ints, radius: Floats, pixel: float, colours: Floats, depth: Floats, image: Floats
 ) -> None:
-    """Paint round wires.
+    """Paint round wires of points (p, 3) with colours (p, 3) in place.
 
-    Parameters
-    ----------
-    screen : (p, 3); points of the wires in screen coordinates.
-    starts : (w + 1,); first point of every wire.
-    radius : (w,); radius in pixels.
-    pixel : size of a pixel in mm. It converts the bulge of a wire towards the eye to depth.
-    colours : (p, 3); colour of every point.
-    depth, image : changed in place.
+    `starts` (w + 1,) are the first points and `radius` (w,) is in pixels. The size of a pixel, in mm, converts the
+    bulge of a wire towards the eye to depth.
     """
     height, width = depth.shape
     for wire in range(len(radius)):
@@ -93,16 +79,8 @@ def veil_triangles(
 ) -> None:
     """Accumulate translucent triangles in front of the opaque ones, in any order.
 
-    Parameters
-    ----------
-    screen, colours, faces, depth : as in `paint_triangles`; `depth` does not change.
-    alphas : (n,); opacity of every vertex.
-    sums : (h, w, 4); alpha times colour, and alpha, are added here.
-    clear : (h, w); multiplied by 1 - alpha.
-
-    References
-    ----------
-    McGuire and Bavoil 2013, JCGT 2(2), eq. 6 with equal weights: weighted blended order-independent transparency.
+    Alpha (n,) times colour, and alpha, are added to `sums` (h, w, 4); `clear` (h, w) is multiplied by 1 - alpha. It is
+    weighted blended order-independent transparency (McGuire and Bavoil 2013, JCGT 2(2), eq. 6 with equal weights).
     """
     height, width = depth.shape
     for f in range(len(faces)):
@@ -115,8 +93,9 @@ def veil_triangles(
         share = 1.0 / area
         z_a, z_b, z_c = p[2], q[2], r[2]
         alpha_a, alpha_b, alpha_c = alphas[i], alphas[j], alphas[k]
-        (red_a, green_a, blue_a), (red_b, green_b, blue_b) = _channels(colours, i), _channels(colours, j)
-        red_c, green_c, blue_c = _channels(colours, k)
+        red_a, green_a, blue_a = colours[i, 0], colours[i, 1], colours[i, 2]
+        red_b, green_b, blue_b = colours[j, 0], colours[j, 1], colours[j, 2]
+        red_c, green_c, blue_c = colours[k, 0], colours[k, 1], colours[k, 2]
         a_step, b_step, c_step = q[1] - r[1], r[1] - p[1], p[1] - q[1]
         has_a, has_b, has_c = _holds(0.0, q, r), _holds(0.0, r, p), _holds(0.0, p, q)
         x0, x1, y0, y1 = _box(p, q, r, 0.0, width, height)
@@ -143,12 +122,6 @@ def veil_triangles(
                 sums[y, x, 2] += alpha * (a * blue_a + b * blue_b + c * blue_c)
                 sums[y, x, 3] += alpha
                 clear[y, x] *= 1.0 - alpha
-
-
-@njit(cache=True, inline="always")
-def _channels(colours: Floats, i: int) -> tuple[float, float, float]:
-    """Return red, green and blue of a vertex."""
-    return colours[i, 0], colours[i, 1], colours[i, 2]
 
 
 @njit(cache=True, inline="always")
@@ -183,16 +156,7 @@ def _box(p: Floats, q: Floats, r: Floats, margin: float, width: int, height: int
 
 @njit(cache=True, nogil=True)
 def resolve(image: Floats, sums: Floats, clear: Floats, supersampling: int) -> Floats:
-    """Blend the translucent layers over the opaque image and average blocks of pixels.
-
-    Parameters
-    ----------
-    image : (h, w, 3); opaque image.
-    sums, clear : (h, w, 4), (h, w); translucent layers from `veil_triangles`.
-    supersampling : edge s of the blocks.
-
-    Returns (h / s, w / s, 3): colours.
-    """
+    """Return colours (h / s, w / s, 3): layers of `veil_triangles` over an opaque image, averaged over s x s pixels."""
     height, width = clear.shape
     result = np.zeros((height // supersampling, width // supersampling, 3))
     share = 1.0 / supersampling**2

@@ -18,14 +18,7 @@ FLATTEST: Final = 0.05
 def stiffness(vertices: Floats, faces: Ints) -> csc_matrix:
     """Return the matrix (n, n) of the Dirichlet energy of piecewise linear functions on a mesh.
 
-    Parameters
-    ----------
-    vertices : (n, 3); vertices.
-    faces : (m, 3); triangles.
-
-    References
-    ----------
-    Pinkall and Polthier 1993, Experiment. Math. 2:15: cotangent weights.
+    Its weights are cotangents (Pinkall and Polthier 1993, Experiment. Math. 2:15).
     """
     n = len(vertices)
     total = csc_matrix((n, n))
@@ -39,29 +32,15 @@ def stiffness(vertices: Floats, faces: Ints) -> csc_matrix:
     return csc_matrix(diags(np.asarray(both.sum(axis=1)).ravel()) - both)
 
 
-def areas_around(vertices: Floats, faces: Ints) -> Floats:
-    """Return a third of the total area (n,) of the triangles at every vertex."""
-    share = np.repeat(triangles.areas(vertices[faces]) / 3, 3)
-    return np.bincount(faces.ravel(), share, minlength=len(vertices)).astype(np.float64)
-
-
 def region(vertices: Floats, faces: Ints, gain: Floats, is_fixed: Bools, reach: float) -> Floats:
     """Return a level (n,), negative inside, of the region with the locally largest gain minus border length.
 
-    Diffusion and threshold alternate, with the gain as a force on the border.
-
-    Parameters
-    ----------
-    vertices, faces : (n, 3), (m, 3); the mesh.
-    gain : (n,); gain per area, in 1 / length. The initial region is where it is positive.
-    is_fixed : (n,); vertices that keep their initial side.
-    reach : length over which the border moves in a step; longer than the mesh's edges.
-
-    References
-    ----------
-    Merriman, Bence and Osher 1994, J. Comput. Phys. 112:334: diffusion and threshold.
+    Diffusion and threshold alternate (Merriman, Bence and Osher 1994, J. Comput. Phys. 112:334), with the gain per area
+    (n,) as a force on the border, in 1 / length. The initial region is where it is positive, and fixed vertices (n,)
+    keep their side. `reach` is the length over which the border moves in a step; it is longer than the mesh's edges.
     """
-    area = np.maximum(areas_around(vertices, faces), 1e-12)
+    share = np.repeat(triangles.areas(vertices[faces]) / 3, 3)
+    area = np.maximum(np.bincount(faces.ravel(), share, minlength=len(vertices)).astype(np.float64), 1e-12)
     solver = splu(csc_matrix(diags(area) + reach**2 * stiffness(vertices, faces)))
     start = gain > 0
     inside = start

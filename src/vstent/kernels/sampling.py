@@ -20,15 +20,7 @@ def _cell_at(index: Any, i: int, j: int, k: int) -> int:
 
 @njit(cache=True)
 def stencil(index: Any, x: float, y: float, z: float, cells: Any, weights: Any) -> float:
-    """Write the eight cells around a point and their trilinear weights; return the sum of the weights inside.
-
-    Parameters
-    ----------
-    index : (i, j, k); cell numbers.
-    x, y, z : point.
-    cells : (8,); set to the cell numbers, -1 outside.
-    weights : (8,); set to the weights.
-    """
+    """Write the eight `cells` around a point and their trilinear `weights`; return the sum of the weights inside."""
     i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
     a, b, c = x - i, y - j, z - k
     inside = 0.0
@@ -53,15 +45,10 @@ def stencils(index: Any, points: Any) -> tuple[Any, Any]:
 
 @njit(cache=True, parallel=True, nogil=True)
 def interpolate(index: Any, values: Any, points: Any, is_zero_outside: bool) -> Any:
-    """Return trilinearly interpolated values (m, d); zero where no cell is near.
+    """Return trilinearly interpolated values (m, d) at points (m, 3); zero where no cell is near.
 
-    Parameters
-    ----------
-    index : (i, j, k); cell numbers.
-    values : (n, d); field.
-    points : (m, 3); points.
-    is_zero_outside : True: cells outside count as zero, as for a velocity with no slip. False: they are left out, as
-        for a pressure.
+    Cells outside count as zero where `is_zero_outside`, as for a velocity with no slip; otherwise they are left out, as
+    for a pressure.
     """
     result = np.zeros((len(points), values.shape[1]))
     for m in prange(len(points)):
@@ -78,23 +65,18 @@ def interpolate(index: Any, values: Any, points: Any, is_zero_outside: bool) -> 
     return result
 
 
-@njit(cache=True)
-def _cubic_weights(t: float, weights: Any) -> None:
-    """Write the weights (4) of cubic Lagrange interpolation at t between values at -1, 0, 1 and 2."""
-    weights[0] = -t * (t - 1.0) * (t - 2.0) / 6.0
-    weights[1] = (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0
-    weights[2] = -(t + 1.0) * t * (t - 2.0) / 2.0
-    weights[3] = (t + 1.0) * t * (t - 1.0) / 6.0
-
-
 @njit(cache=True, parallel=True, nogil=True)
 def interpolate_cubic(index: Any, values: Any, points: Any) -> Any:
     """Return tricubic values (m, d) at points (m, 3) from the 64 cells around each; cells outside count as zero."""
     result = np.zeros((len(points), values.shape[1]))
     for m in prange(len(points)):
         weights = np.zeros((3, 4))
-        for axis in range(3):
-            _cubic_weights(points[m, axis] - np.floor(points[m, axis]), weights[axis])
+        for axis in range(3):  # cubic Lagrange interpolation at t between values at -1, 0, 1 and 2
+            t = points[m, axis] - np.floor(points[m, axis])
+            weights[axis, 0] = -t * (t - 1.0) * (t - 2.0) / 6.0
+            weights[axis, 1] = (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0
+            weights[axis, 2] = -(t + 1.0) * t * (t - 2.0) / 2.0
+            weights[axis, 3] = (t + 1.0) * t * (t - 1.0) / 6.0
         i, j, k = int(np.floor(points[m, 0])), int(np.floor(points[m, 1])), int(np.floor(points[m, 2]))
         for n in range(64):
             a, b, c = n >> 4, (n >> 2) & 3, n & 3
@@ -143,24 +125,12 @@ def _trace(index: Any, velocity: Any, seed: Any, step: float, slowest: float, pa
 
 @njit(cache=True, parallel=True)
 def trace_all(index: Any, velocity: Any, seeds: Any, step: float, slowest: float, most: int) -> tuple[Any, Any]:
-    """Return streamlines from seeds, integrated with the classical fourth-order Runge-Kutta method.
+    """Return streamlines from seeds (s, 3), integrated with the classical fourth-order Runge-Kutta method.
 
     The integration runs over arc length, so that slow blood needs no more points than fast blood. A streamline ends
-    outside the cells, below the speed `slowest`, or after `most` points.
+    outside the cells, below the speed `slowest`, or after `most` points. Steps of negative length lead upstream.
 
-    Parameters
-    ----------
-    index : (i, j, k); cell numbers.
-    velocity : (n, 3); velocity field.
-    seeds : (s, 3); first points.
-    step : step length in cells; negative: upstream.
-    slowest : speed at which a streamline ends.
-    most : maximum number of points.
-
-    Returns
-    -------
-    path : (s, most, 4); points and speeds.
-    count : (s,); number of points of each streamline.
+    Returns points and speeds (s, most, 4), and the number (s,) of points of each streamline.
     """
     path = np.zeros((len(seeds), most, 4))
     count = np.zeros(len(seeds), np.int32)
@@ -192,7 +162,7 @@ def _solve(matrix: Any, right: Any) -> None:
 
 @njit(cache=True, parallel=True, nogil=True)
 def fit_wall(index: Any, distance: Any, velocity: Any, pressure: Any, points: Any, normals: Any, reach: int) -> Any:
-    """Return the wall-normal velocity gradient (3) and the pressure at wall points, (m, 4).
+    """Return the wall-normal velocity gradient (3) and the pressure at wall points with inward unit normals, (m, 4).
 
     Both are weighted least-squares fits over the cells within `reach` of a point, with d the distance of the cell from
     the wall and s, t tangential coordinates, all in cells:
@@ -201,16 +171,6 @@ def fit_wall(index: Any, distance: Any, velocity: Any, pressure: Any, points: An
     for Poiseuille flow in a straight tube; the cubic term represents the curvature near the wall in a pulse.
 
     pressure = a + b d + c s + e t.
-
-    Parameters
-    ----------
-    index : (i, j, k); cell numbers.
-    distance : (n,); distance of every cell from the wall, in cells.
-    velocity : (n, 3); velocity field.
-    pressure : (n,); pressure field.
-    points : (m, 3); wall points.
-    normals : (m, 3); inward unit normals.
-    reach : radius of the fit, in cells.
     """
     result = np.zeros((len(points), 4))
     for m in prange(len(points)):

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from vstent.kernels import triangles
+from vstent.kernels import topology
 from vstent.kernels.arrays import Bools, Floats, Ints
 
 
@@ -24,48 +24,31 @@ class Sheet(NamedTuple):
 
 
 def sheet(vertices: Floats, faces: Ints, weights: Floats) -> Sheet:
-    """Return a mesh with the neighbours and the integrals of its faces.
-
-    Parameters
-    ----------
-    vertices : (n, 3); vertices.
-    faces : (m, 3); vertex indices, with at most two faces at an edge.
-    weights : (m, w); weights of each face in the sums of areas.
-    """
-    edges = np.sort(triangles.directed_edges(faces), axis=1).astype(np.int64)
-    key = edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1]
-    order = np.argsort(key, kind="stable")
-    twin = np.flatnonzero(key[order][1:] == key[order][:-1])
-    neighbours = np.full(len(edges), -1, dtype=np.int32)
-    one, other = order[twin], order[twin + 1]
-    neighbours[one], neighbours[other] = other % len(faces), one % len(faces)
+    """Return a mesh, with at most two faces at an edge, and the integrals of its faces with weights (m, w) of areas."""
+    edges = topology.edges_of(faces)
+    one = edges.starts[edges.n_uses == 2]
+    neighbours = np.full((len(faces), 3), -1, dtype=np.int32)
+    for use, other in ((one, one + 1), (one + 1, one)):
+        neighbours[edges.face[use], edges.side[use]] = edges.face[other]
     a, b, c = vertices[faces].transpose(1, 0, 2)
     vector = 0.5 * np.cross(b - a, c - a)
     tetrahedron = np.einsum("fi,fi->f", a, np.cross(b, c))
     terms = np.column_stack([tetrahedron, vector, np.linalg.norm(vector, axis=1)[:, None] * weights])
-    across = np.ascontiguousarray(neighbours.reshape(3, -1).T)
-    return Sheet(np.array(vertices, order="C"), np.array(faces, dtype=np.int32, order="C"), across, terms)
+    return Sheet(np.array(vertices, order="C"), np.array(faces, dtype=np.int32, order="C"), neighbours, terms)
 
 
 def beyond(mesh: Sheet, seed: int, points: Floats, normals: Floats) -> tuple[Floats, Bools]:
-    """Measure the part of a mesh that each of several planes cuts off.
+    """Measure the part of a mesh beyond each of several planes: points (k, 3), unit normals (k, 3) toward the part.
 
-    The part is the wall beyond the plane that is connected to a face. It includes pouches that hang back through the
-    plane and have no boundary of their own, so the section is the area of the other openings.
-
-    Parameters
-    ----------
-    seed : a face of the part.
-    points, normals : (k, 3); a point on each plane, and its unit normal, toward the part.
+    The part is the wall beyond the plane that is connected to the face `seed`. It includes pouches that hang back
+    through the plane and have no boundary of their own, so the section is the area of the other openings.
 
     Returns
     -------
-    measures : (k, 2 + w); volume of the part closed by the plane, area of its section, and its weighted areas.
-    is_closed : (k,); whether the plane cuts off a part without open edges of the mesh; without one, the measures are
-        not complete.
+    measures : (k, 2 + w) volume of the part closed by the plane, area of its section, and its weighted areas.
+    is_closed : (k,) whether the part has no open edges of the mesh; otherwise the measures are not complete.
     """
-    rows = np.ascontiguousarray(points), np.ascontiguousarray(normals)
-    return _beyond(*mesh, seed, *rows)
+    return _beyond(*mesh, seed, np.ascontiguousarray(points), np.ascontiguousarray(normals))
 
 
 @njit(cache=True)

@@ -11,11 +11,6 @@ def averaging(n_vertices: int, faces: Ints) -> csr_array:
     """Return the sparse (n, n) matrix that averages a value over the neighbours of each vertex.
 
     A vertex on an open edge has only its neighbours along that edge, so that openings do not shrink.
-
-    Parameters
-    ----------
-    n_vertices : number of vertices.
-    faces : (m, 3); triangles.
     """
     edges = np.sort(triangles.directed_edges(faces), axis=1).astype(np.int64)
     code, count = np.unique(edges[:, 0] * n_vertices + edges[:, 1], return_counts=True)
@@ -31,24 +26,12 @@ def averaging(n_vertices: int, faces: Ints) -> csr_array:
 
 
 def taubin(vertices: Floats, faces: Ints, *, iterations: int, pass_band: float) -> Floats:
-    """Smooth a mesh without shrinking it.
+    """Smooth a mesh without shrinking it, by the lambda | mu algorithm (Taubin 1995, ICCV).
 
-    A step with factor lambda and one with factor mu alternate. The gain (1 - lambda k)(1 - mu k) is 1 at k = 0 and at k
-    = k_PB, with 1 / mu = k_PB - 1 / lambda.
-
-    Parameters
-    ----------
-    vertices : (n, 3); vertices.
-    faces : (m, 3); triangles.
-    iterations : number of pairs of steps.
-    pass_band : k_PB: components with a Laplacian eigenvalue (0 to 2) below it are kept.
-
-    References
-    ----------
-    Taubin 1995, ICCV: the lambda | mu algorithm.
+    A step with factor lambda and one with factor mu alternate. The gain (1 - lambda k)(1 - mu k) is 1 at k = 0 and at
+    the pass band k_PB, with 1 / mu = k_PB - 1 / lambda: components with a Laplacian eigenvalue (0 to 2) below it stay.
     """
-    mean = averaging(len(vertices), faces)
-    shrink = 0.6
+    mean, shrink = averaging(len(vertices), faces), 0.6
     grow = 1.0 / (pass_band - 1.0 / shrink)
     has_neighbours = (np.diff(mean.indptr) > 0)[:, None]
     for factor in (shrink, grow) * iterations:
@@ -59,13 +42,8 @@ def taubin(vertices: Floats, faces: Ints, *, iterations: int, pass_band: float) 
 def mean_curvature(vertices: Floats, faces: Ints, *, rounds: int) -> Floats:
     """Return the mean curvature (n,) at the vertices; 1 / (2 R) on a cylinder seen from outside.
 
-    It is half the divergence of the vertex normals, which are interpolated linearly on every face.
-
-    Parameters
-    ----------
-    vertices : (n, 3); vertices.
-    faces : (m, 3); triangles.
-    rounds : number of times that the curvature is averaged over neighbouring vertices.
+    It is half the divergence of the vertex normals, which are interpolated linearly on every face, averaged over
+    neighbouring vertices `rounds` times.
     """
     corners, n = vertices[faces], len(vertices)
     normal, double_area = triangles.normals(corners), np.maximum(2 * triangles.areas(corners), 1e-12)

@@ -4,8 +4,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from vstent.kernels import triangles
@@ -32,25 +30,20 @@ class Edges(NamedTuple):
 def edges_of(faces: Ints) -> Edges:
     """Return the sorted edges of faces (m, 3)."""
     directed = triangles.directed_edges(faces).astype(np.int64)
-    low, high = directed.min(axis=1), directed.max(axis=1)
+    low, high = np.sort(directed, axis=1).T
     code = low * (high.max(initial=0) + 1) + high
     order = np.argsort(code, kind="stable")
-    ordered = code[order]
-    starts = (
-        np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]])) if len(code) else np.zeros(0, np.int64)
-    )
-    count = np.diff(np.concatenate([starts, [len(code)]]))
-    side, face = np.divmod(order, len(faces)) if len(faces) else (order, order)
-    return Edges(face, side, directed[order, 0] < directed[order, 1], starts, count)
+    starts, n_uses = np.unique(code[order], return_index=True, return_counts=True)[1:]
+    side, face = np.divmod(order, max(len(faces), 1))
+    return Edges(face, side, directed[order, 0] < directed[order, 1], starts, n_uses)
 
 
 def weld(vertices: Floats, faces: Ints, tolerance: float) -> tuple[Floats, Ints]:
     """Merge vertices that are closer than `tolerance`, transitively; the first of each group is kept."""
     kept, same = first_equals(vertices)  # otherwise every pair of many equal points would be listed as near
-    pairs = cKDTree(vertices[kept]).query_pairs(tolerance, output_type="ndarray")
-    label = _components(len(kept), pairs[:, 0], pairs[:, 1])
+    label = triangles.joined(cKDTree(vertices[kept]).query_pairs(tolerance, output_type="ndarray"), len(kept))
     _, first = np.unique(label, return_index=True)
-    return vertices[kept[first]], label[same[faces]].astype(np.int32)
+    return vertices[kept[first]], label[same[faces]]
 
 
 CRACK_OF_EDGE: Final = (0.001, 0.003, 0.01, 0.03, 0.1)
@@ -62,42 +55,31 @@ CLOSED: Final = 0.5
 def without_cracks(vertices: Floats, faces: Ints) -> tuple[Ints, float]:
     """Merge the vertices of open edges that miss each other by little, where most open edges meet then.
 
-    Parameters
-    ----------
-    vertices, faces : (n, 3) and (m, 3); mesh without equal vertices.
-
-    Returns
-    -------
-    faces : (m, 3); faces on the vertices that are kept.
-    width : smallest width at which most edges meet; 0 where nothing was merged.
+    The mesh has no equal vertices. Returns faces (m, 3) on the vertices that are kept, and the smallest width at which
+    most edges meet; 0 where nothing was merged.
     """
-    edges = edges_of(faces)
-    single = edges.starts[edges.n_uses == 1]
-    face, side = edges.face[single], edges.side[single]
-    rims = np.stack([faces[face, side], faces[face, (side + 1) % 3]], axis=1)
+    rims = triangles.open_edges(faces)
     rim, place = np.unique(rims, return_inverse=True)
-    place = place.reshape(-1, 2)
     if not len(rim):
         return faces, 0.0
-    lengths = np.linalg.norm(vertices[rims[:, 0]] - vertices[rims[:, 1]], axis=1)
-    widths = np.array(CRACK_OF_EDGE) * float(np.median(lengths))
+    widths = np.array(CRACK_OF_EDGE) * float(
+        np.median(np.linalg.norm(vertices[rims[:, 0]] - vertices[rims[:, 1]], axis=1))
+    )
     tree = cKDTree(vertices[rim])
-    labels = [_components(len(rim), *tree.query_pairs(width, output_type="ndarray").T) for width in widths]
-    closed = np.array([_n_meeting(label[place]) for label in labels])
-    if closed.max() < CLOSED * len(rims):
+    labels = [triangles.joined(tree.query_pairs(width, output_type="ndarray"), len(rim)) for width in widths]
+    meeting = []
+    for label in labels:
+        edges = np.sort(label[place.reshape(-1, 2)].astype(np.int64), axis=1)
+        edges = edges[edges[:, 0] != edges[:, 1]]
+        count = np.unique(edges[:, 0] * len(rim) + edges[:, 1], return_counts=True)[1]
+        meeting.append(int(count[count > 1].sum()))
+    best = int(np.argmax(meeting))  # the first of equals
+    if meeting[best] < CLOSED * len(rims):
         return faces, 0.0
-    best = int(np.argmax(closed))  # the first of equals
     _, first, group = np.unique(labels[best], return_index=True, return_inverse=True)
     same = np.arange(len(vertices))
     same[rim] = rim[first[group]]
     return same[faces].astype(np.int32), float(widths[best])
-
-
-def _n_meeting(edges: Labels) -> int:
-    """Return the number of edges (e, 2) with two different ends that occur more than once."""
-    ordered = np.sort(edges[edges[:, 0] != edges[:, 1]], axis=1)
-    count = np.unique(ordered[:, 0] * (ordered.max(initial=0) + 1) + ordered[:, 1], return_counts=True)[1]
-    return int(count[count > 1].sum())
 
 
 def first_equals(vertices: Floats) -> tuple[Ints, Ints]:
@@ -105,15 +87,12 @@ def first_equals(vertices: Floats) -> tuple[Ints, Ints]:
     rows = np.ascontiguousarray(vertices + 0.0, dtype=np.float64).view("V24").ravel()
     _, first, same = np.unique(rows, return_index=True, return_inverse=True)
     order = np.argsort(first)
-    place = np.zeros(len(order), dtype=np.int64)
-    place[order] = np.arange(len(order))
-    return first[order], place[same.ravel()]
+    return first[order], np.argsort(order)[same.ravel()]
 
 
 def _components(n: int, a: NDArray[np.integer], b: NDArray[np.integer]) -> Labels:
     """Return the component (n,) of every node of the graph with edges a - b."""
-    graph = coo_array((np.ones(len(a), dtype=np.int8), (a, b)), shape=(n, n))
-    return connected_components(graph, directed=False)[1].astype(np.int64)
+    return triangles.joined(np.stack([a, b], axis=1), n).astype(np.int64)
 
 
 def sound_faces(faces: Ints) -> Bools:
@@ -131,8 +110,15 @@ def sound_faces(faces: Ints) -> Bools:
 
 def face_components(faces: Ints) -> Labels:
     """Return the component (m,) of every face; faces are connected by shared edges."""
+    pairs = face_neighbours(faces)
+    return _components(len(faces), pairs[:, 0], pairs[:, 1])
+
+
+def face_neighbours(faces: Ints) -> Ints:
+    """Return pairs (k, 2) of faces that share an edge; more than two faces at an edge are paired in a chain."""
     edges = edges_of(faces)
-    return _components(len(faces), edges.face, edges.face[np.repeat(edges.starts, edges.n_uses)])
+    later = np.delete(np.arange(len(edges.face)), edges.starts)
+    return np.stack([edges.face[later - 1], edges.face[later]], axis=1).astype(np.int32)
 
 
 def patches(faces: Ints) -> Labels:
@@ -164,24 +150,16 @@ def oriented(faces: Ints) -> tuple[Ints, Bools]:
     component = np.minimum(sheet[:m], sheet[m:])
     many = np.bincount(component[turned], minlength=2 * m) * 2 > np.bincount(component, minlength=2 * m)
     turned ^= many[component]
-    if (sheet[:m] == sheet[m:]).any():
-        turned = _settled(turned, f, g, is_clash)
-    return np.where(turned[:, None], faces[:, ::-1], faces), turned
-
-
-def _settled(turned: Bools, f: Labels, g: Labels, is_clash: Bools) -> Bools:
-    """Return which faces are turned after turning those that clash with most of their neighbours, until none does."""
-    m = len(turned)
     degree = np.bincount(f, minlength=m) + np.bincount(g, minlength=m)
-    while True:
+    while (sheet[:m] == sheet[m:]).any():
         clash = is_clash ^ turned[f] ^ turned[g]
-        n_clash = np.bincount(f[clash], minlength=m) + np.bincount(g[clash], minlength=m)
-        wants = 2 * n_clash > degree
+        wants = 2 * (np.bincount(f[clash], minlength=m) + np.bincount(g[clash], minlength=m)) > degree
         both = wants[f] & wants[g]
         wants[np.maximum(f[both], g[both])] = False
         if not wants.any():
-            return turned
-        turned = turned ^ wants
+            break
+        turned ^= wants
+    return np.where(turned[:, None], faces[:, ::-1], faces), turned
 
 
 def clashing(faces: Ints) -> Bools:
@@ -270,18 +248,10 @@ def _wedges(vertices: Floats, faces: Ints, edges: Edges, uses: Labels) -> Labels
 
 
 def least_area(polygon: Floats, is_taken: Bools) -> Ints | None:
-    """Return the triangulation (n - 2, 3) of a closed polygon with the smallest area; None if there is none.
+    """Return the triangulation (n - 2, 3) of a closed polygon (n, 3) with the smallest area; None if there is none.
 
-    The triangles have the direction of the polygon. The search is a dynamic programme over its chords.
-
-    Parameters
-    ----------
-    polygon : (n, 3); closed polygon.
-    is_taken : (n, n); pairs of vertices between which no chord is allowed.
-
-    References
-    ----------
-    Barequet and Sharir 1995, Comput. Aided Geom. Des. 12:207, sec. 3.2.
+    The triangles have the direction of the polygon. No chord joins the pairs of vertices (n, n) that are taken. The
+    search is a dynamic programme over the chords (Barequet and Sharir 1995, Comput. Aided Geom. Des. 12:207, sec. 3.2).
     """
     n = len(polygon)
     cost, apex = np.zeros((n, n)), np.zeros((n, n), dtype=np.int32)

@@ -1,11 +1,13 @@
 """Bounding-box tree over triangles: closest point, signed distance, crossings and first hit of a ray.
 
-The triangles of a node are halved at the median along the longest side of their box, down to leaves of `LEAF`. The
-leaves are the last level of a complete binary tree stored as a heap without pointers: the children of node i are 2 i +
-1 and 2 i + 2.
+The triangles of a node are halved at the median along the longest side of their box, down to one triangle per leaf.
+The leaves are the last level of a complete binary tree stored as a heap without pointers: the children of node i are
+2 i + 1 and 2 i + 2.
 """
 
-from typing import Any, Final, NamedTuple
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Final
 
 import numpy as np
 from numba import njit, prange
@@ -13,16 +15,18 @@ from numba import njit, prange
 from vstent.kernels import triangles
 from vstent.kernels.arrays import Bools, Floats, Ints
 
-LEAF: Final = 1
-"""Number of triangles per leaf. Testing a box is cheaper than testing a triangle: with 4 a closest point takes a
-quarter longer."""
 _STACK: Final = 64
 """Size of the stack of nodes to visit."""
 
 
-class Tree(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Tree:
     """The tree as arrays."""
 
+    vertices: Floats
+    """(n, 3) vertices of the surface."""
+    faces: Ints
+    """(m, 3) faces of the surface."""
     corners: Floats
     """(m, 3, 3) triangles in tree order."""
     face: Ints
@@ -31,18 +35,22 @@ class Tree(NamedTuple):
     """(nodes, 3) lower corner of every node's box."""
     high: Floats
     """(nodes, 3) upper corner of every node's box."""
-    pseudonormal: Floats
-    """(m, 7, 3) normals of each triangle's face, edges 01, 12, 20 and corners 0, 1, 2."""
+    rise: Floats | None = None
+    """(m, 3) rise (n_b - n_a) (b - a) of the edges 01, 12, 20 of curved triangles, which the boxes contain. An edge
+    bulges by t (1 - t) / 2 times its rise. None for flat triangles."""
 
+    @cached_property
+    def pseudonormal(self) -> Floats:
+        """(m, 7, 3) normals of each triangle's face, edges 01, 12, 20 and corners 0, 1, 2, in tree order.
 
-class Curved(NamedTuple):
-    """A tree over curved triangles: the smooth wall through the corners."""
-
-    flat: Tree
-    """Tree over the flat triangles, whose boxes contain the curved ones."""
-    rise: Floats
-    """(m, 3) rise (n_b - n_a) (b - a) of the edges 01, 12, 20 in tree order. An edge bulges by t (1 - t) / 2 times its
-    rise."""
+        Their sign test is exact on closed surfaces (Baerentzen and Aanaes 2005, IEEE TVCG 11(3)).
+        """
+        normals = triangles.normals(self.vertices[self.faces])
+        low, high = np.sort([self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()], axis=0).astype(np.int64)
+        edge = np.unique(low * len(self.vertices) + high, return_inverse=True)[1]
+        at_edge = np.stack([np.bincount(edge, np.repeat(normals[:, k], 3)) for k in range(3)], axis=1)
+        at_corner = triangles.vertex_normals(self.vertices, self.faces)[self.faces]
+        return np.concatenate([normals[:, None], at_edge[edge].reshape(-1, 3, 3), at_corner], axis=1)[self.face]
 
 
 def build(vertices: Floats, faces: Ints) -> Tree:
@@ -50,26 +58,19 @@ def build(vertices: Floats, faces: Ints) -> Tree:
     corners = vertices[faces]
     order = _median_order(corners.mean(axis=1))
     corners = np.ascontiguousarray(corners[order])
-    n_leaves = 1 << max(0, int(np.ceil(np.log2(max(1, -(-len(faces) // LEAF))))))
-    low, high = _boxes(corners, n_leaves, np.zeros(len(corners)))
-    pseudonormal = _pseudonormals(vertices, faces)[order]
-    return Tree(corners, order, low, high, pseudonormal)
+    n_leaves = 1 << int(np.ceil(np.log2(max(1, len(faces)))))
+    return Tree(vertices, faces, corners, order, *_boxes(corners, n_leaves, np.zeros(len(corners))))
 
 
-def curved(tree: Tree, normals: Floats) -> Curved:
-    """Return the tree with its triangles curved by normals at their corners.
+def curved(tree: Tree, normals: Floats) -> Tree:
+    """Return the tree with its triangles curved by unit normals (m, 3, 3) at the corners of every face.
 
     Along an edge the quadratic with the normals of its ends rises by t (1 - t) / 2 times (n_b - n_a) (b - a). Inside a
     triangle the contributions of the edges are added.
-
-    Parameters
-    ----------
-    tree : tree over flat triangles.
-    normals : (m, 3, 3); unit normals at the corners of every face, in the order of the surface.
     """
     rise = triangles.edge_rises(tree.corners, normals[tree.face])
     low, high = _boxes(tree.corners, (len(tree.low) + 1) // 2, np.abs(rise).sum(axis=1) / 8)
-    return Curved(tree._replace(low=low, high=high), rise)
+    return replace(tree, low=low, high=high, rise=rise)
 
 
 @njit(cache=True)
@@ -77,29 +78,23 @@ def _median_order(points: Any) -> Any:
     """Return the order (m,) in which each node's triangles are halved along the longest side."""
     n = len(points)
     order = np.arange(n).astype(np.int32)
-    block = LEAF
+    block = 1
     while block < n:
         block *= 2
-    while block > LEAF:
+    while block > 1:
         half = block // 2
         for start in range(0, n - half, block):
             end = min(start + block, n)
-            _part(points[:, _longest_side(points, order, start, end)], order, start, end - 1, start + half)
+            axis, longest = 0, -1.0
+            for k in range(3):
+                low, high = np.inf, -np.inf
+                for i in range(start, end):
+                    low, high = min(low, points[order[i], k]), max(high, points[order[i], k])
+                if high - low > longest:
+                    axis, longest = k, high - low
+            _part(points[:, axis], order, start, end - 1, start + half)
         block = half
     return order
-
-
-@njit(cache=True)
-def _longest_side(points: Any, order: Any, start: int, end: int) -> int:
-    """Return the axis along which the points of a node extend furthest."""
-    best, longest = 0, -1.0
-    for k in range(3):
-        low, high = np.inf, -np.inf
-        for i in range(start, end):
-            low, high = min(low, points[order[i], k]), max(high, points[order[i], k])
-        if high - low > longest:
-            best, longest = k, high - low
-    return best
 
 
 @njit(cache=True)
@@ -132,7 +127,7 @@ def _boxes(corners: Any, n_leaves: int, margin: Any) -> tuple[Any, Any]:
     low = np.full((2 * n_leaves - 1, 3), np.inf)
     high = np.full((2 * n_leaves - 1, 3), -np.inf)
     for f in range(len(corners)):
-        leaf = n_leaves - 1 + f // LEAF
+        leaf = n_leaves - 1 + f
         for k in range(3):
             for corner in range(3):
                 low[leaf, k] = min(low[leaf, k], corners[f, corner, k] - margin[f])
@@ -148,51 +143,6 @@ def _boxes(corners: Any, n_leaves: int, margin: Any) -> tuple[Any, Any]:
     return low, high
 
 
-def _pseudonormals(vertices: Floats, faces: Ints) -> Floats:
-    """Return angle-weighted pseudonormals (m, 7, 3), whose sign test is exact on closed surfaces.
-
-    References
-    ----------
-    Baerentzen and Aanaes 2005, IEEE TVCG 11(3).
-    """
-    corners = vertices[faces]
-    result = np.zeros((len(faces), 7, 3))
-    result[:, 0] = triangles.normals(corners)
-    result[:, 4:7] = triangles.vertex_normals(vertices, faces)[faces]
-    _add_edge_normals(np.ascontiguousarray(faces), len(vertices), result)
-    return result
-
-
-@njit(cache=True)
-def _add_edge_normals(faces: Any, n_vertices: int, result: Any) -> None:
-    """Write the sum of the normals of all faces at each edge into `result` (m, 7, 3), places 1 to 3.
-
-    The edges from each vertex to higher ones are listed per vertex, so that only a few are compared.
-    """
-    m = len(faces)
-    begin = np.zeros(n_vertices + 1, dtype=np.int64)
-    for f in range(m):
-        for k in range(3):
-            begin[min(faces[f, k], faces[f, (k + 1) % 3]) + 1] += 1
-    begin = np.cumsum(begin)
-    filled = begin[:-1].copy()
-    use = np.zeros(3 * m, dtype=np.int64)
-    for f in range(m):
-        for k in range(3):
-            low = min(faces[f, k], faces[f, (k + 1) % 3])
-            use[filled[low]] = 3 * f + k
-            filled[low] += 1
-    for low in range(n_vertices):
-        for i in range(begin[low], begin[low + 1]):
-            f, k = use[i] // 3, use[i] % 3
-            high = max(faces[f, k], faces[f, (k + 1) % 3])
-            for j in range(begin[low], begin[low + 1]):
-                g, n = use[j] // 3, use[j] % 3
-                if max(faces[g, n], faces[g, (n + 1) % 3]) == high:
-                    for axis in range(3):
-                        result[f, 1 + k, axis] += result[g, 0, axis]
-
-
 def _plain(points: Floats) -> Floats:
     """Return points as a writable array: numba compiles separate code for read-only arrays."""
     points = np.ascontiguousarray(points, dtype=np.float64)
@@ -201,40 +151,30 @@ def _plain(points: Floats) -> Floats:
 
 def closest_points(tree: Tree, points: Floats) -> tuple[Floats, Floats, Ints]:
     """Return the closest point (n, 3) of the surface, its distance (n,) and its face (n,) for points (n, 3)."""
-    points = _plain(points)
-    closest, distance, triangle, _ = _closest_all(tree.corners, tree.low, tree.high, points)
+    closest, distance, triangle, _ = _closest_all(tree.corners, tree.low, tree.high, _plain(points))
     return closest, distance, tree.face[triangle]
 
 
-def inscribed_radii(wall: Curved, points: Floats) -> Floats:
-    """Return the distance (n,) of points (n, 3) inside a wall to its curved triangles."""
-    return _inscribed_all(wall.flat.corners, wall.rise, wall.flat.low, wall.flat.high, _plain(points))
+def inscribed_radii(tree: Tree, points: Floats) -> Floats:
+    """Return the distance (n,) of points (n, 3) inside a wall to its curved triangles, at least 0."""
+    return _inscribed_all(tree.corners, tree.rise, tree.low, tree.high, _plain(points))
 
 
 def signed_distances(tree: Tree, points: Floats) -> Floats:
     """Return the distance (n,) of points (n, 3) to a closed surface, negative inside."""
-    points = _plain(points)
-    closest, distance, triangle, feature = _closest_all(tree.corners, tree.low, tree.high, points)
-    normal = tree.pseudonormal[triangle, feature]
-    return np.where(np.einsum("ij,ij->i", points - closest, normal) < 0, -distance, distance)
+    closest, distance, triangle, feature = _closest_all(tree.corners, tree.low, tree.high, _plain(points))
+    side = np.einsum("ij,ij->i", points - closest, tree.pseudonormal[triangle, feature])
+    return np.where(side < 0, -distance, distance)
 
 
 def segments_cross(tree: Tree, starts: Floats, ends: Floats) -> Bools:
     """Return for each segment, from starts (n, 3) to ends (n, 3), whether it meets a triangle."""
-    starts = _plain(starts)
-    return _first_hit_all(tree.corners, tree.low, tree.high, starts, ends - starts, 1.0)[0] <= 1.0
+    return _first_hit_all(tree.corners, tree.low, tree.high, _plain(starts), ends - starts, 1.0)[0] <= 1.0
 
 
 def first_hits(tree: Tree, origins: Floats, directions: Floats) -> tuple[Floats, Ints]:
-    """Return the distance (n,) to the first triangle along rays, inf where there is none, and its face (n,).
-
-    Parameters
-    ----------
-    tree : tree over the triangles.
-    origins, directions : (n, 3); origins and unit directions of the rays.
-    """
-    origins, directions = _plain(origins), _plain(directions)
-    distance, triangle = _first_hit_all(tree.corners, tree.low, tree.high, origins, directions, np.inf)
+    """Return the distance (n,) to the first triangle along unit rays (n, 3), inf where there is none, and its face."""
+    distance, triangle = _first_hit_all(tree.corners, tree.low, tree.high, _plain(origins), _plain(directions), np.inf)
     return distance, tree.face[triangle]
 
 
@@ -244,19 +184,9 @@ def sees_inside(tree: Tree, origins: Floats, directions: Floats) -> Bools:
     This is true for every ray of a point inside. Where all walls are about equally near, it is much faster than a
     search for the closest point.
     """
-    origins, directions = _plain(origins), _plain(directions)
-    hit, triangle = _first_hit_all(tree.corners, tree.low, tree.high, origins, directions, np.inf)
-    return np.isfinite(hit) & (np.einsum("ij,ij->i", tree.pseudonormal[triangle, 0], directions) > 0)
-
-
-@njit(cache=True)
-def _box_distance2(point: Any, low: Any, high: Any) -> float:
-    """Return the squared distance of a point from a box."""
-    total = 0.0
-    for k in range(3):
-        gap = max(low[k] - point[k], 0.0, point[k] - high[k])
-        total += gap * gap
-    return total
+    distance, face = first_hits(tree, origins, directions)
+    normals = triangles.normals(tree.vertices[tree.faces[face]])
+    return np.isfinite(distance) & (np.einsum("ij,ij->i", normals, directions) > 0)
 
 
 @njit(cache=True)
@@ -267,7 +197,7 @@ def _dot(a0: float, a1: float, a2: float, b0: float, b1: float, b2: float) -> fl
 
 @njit(cache=True)
 def _closest_on_longest_edge(t: Any, p: Any, ab_ab: float, ac_ac: float) -> tuple[float, float, int]:
-    """Return the result of `closest_on_triangle` for a triangle whose corners lie on one line."""
+    """Return the result of `_closest_on_triangle` for a triangle whose corners lie on one line."""
     bc_bc = 0.0
     for k in range(3):
         bc_bc += (t[2, k] - t[1, k]) ** 2
@@ -283,16 +213,11 @@ def _closest_on_longest_edge(t: Any, p: Any, ab_ab: float, ac_ac: float) -> tupl
 
 
 @njit(cache=True)
-def closest_on_triangle(p: Any, t: Any) -> tuple[float, float, int]:
+def _closest_on_triangle(p: Any, t: Any) -> tuple[float, float, int]:
     """Return barycentric weights (v, w) of the closest point a + v ab + w ac, and the feature on which it lies.
 
-    Features are 0 for the face, 1, 2, 3 for the edges ab, bc, ca, and 4, 5, 6 for the corners a, b, c.
-
-    Shapes: `p` (3,), `t` (3, 3).
-
-    References
-    ----------
-    Ericson 2005, Real-Time Collision Detection, sec. 5.1.5.
+    Features are 0 for the face, 1, 2, 3 for the edges ab, bc, ca, and 4, 5, 6 for the corners a, b, c (Ericson 2005,
+    Real-Time Collision Detection, sec. 5.1.5).
     """
     ab0, ab1, ab2 = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
     ac0, ac1, ac2 = t[2, 0] - t[0, 0], t[2, 1] - t[0, 1], t[2, 2] - t[0, 2]
@@ -329,41 +254,67 @@ def closest_on_triangle(p: Any, t: Any) -> tuple[float, float, int]:
 
 
 @njit(cache=True)
+def ray_meets_triangle(o: Any, d: Any, t: Any) -> float:
+    """Return the parameter s at which the ray o + s d hits a triangle, inf where it misses (Moeller, Trumbore 1997)."""
+    e0, e1, e2 = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
+    f0, f1, f2 = t[2, 0] - t[0, 0], t[2, 1] - t[0, 1], t[2, 2] - t[0, 2]
+    h0, h1, h2 = d[1] * f2 - d[2] * f1, d[2] * f0 - d[0] * f2, d[0] * f1 - d[1] * f0
+    det = e0 * h0 + e1 * h1 + e2 * h2
+    if abs(det) < 1e-300:
+        return np.inf
+    s0, s1, s2 = o[0] - t[0, 0], o[1] - t[0, 1], o[2] - t[0, 2]
+    u = (s0 * h0 + s1 * h1 + s2 * h2) / det
+    q0, q1, q2 = s1 * e2 - s2 * e1, s2 * e0 - s0 * e2, s0 * e1 - s1 * e0
+    v = (d[0] * q0 + d[1] * q1 + d[2] * q2) / det
+    # The tolerance closes the seams between triangles: a ray through a shared edge must hit one of them.
+    if u < -1e-12 or v < -1e-12 or u + v > 1.0 + 1e-12:
+        return np.inf
+    s = (f0 * q0 + f1 * q1 + f2 * q2) / det
+    return s if s >= 0.0 else np.inf
+
+
+@njit(cache=True)
+def _away2(point: Any, low: Any, high: Any) -> float:
+    """Return the squared distance of a point from a box."""
+    total = 0.0
+    for k in range(3):
+        gap = max(low[k] - point[k], 0.0, point[k] - high[k])
+        total += gap * gap
+    return total
+
+
+@njit(cache=True)
 def _closest_one(corners: Any, low: Any, high: Any, p: Any, best: Any) -> tuple[float, int, int]:
     """Write the closest point into `best`; return its squared distance, triangle and feature."""
     first_leaf = low.shape[0] // 2
-    stack = np.zeros(_STACK, dtype=np.int32)
-    bound = np.zeros(_STACK)
-    size, best2, best_triangle, best_feature = 1, np.inf, 0, 0
+    stack, bound = np.zeros(_STACK, dtype=np.int32), np.zeros(_STACK)
+    size, best2, best_triangle, best_feature = min(1, len(corners)), np.inf, 0, 0
     while size > 0:
         size -= 1
         node = stack[size]
         if bound[size] >= best2:
             continue
-        if node >= first_leaf:
-            start = (node - first_leaf) * LEAF
-            for i in range(start, min(start + LEAF, corners.shape[0])):
-                t = corners[i]
-                v, w, feature = closest_on_triangle(p, t)
-                c0 = t[0, 0] + v * (t[1, 0] - t[0, 0]) + w * (t[2, 0] - t[0, 0])
-                c1 = t[0, 1] + v * (t[1, 1] - t[0, 1]) + w * (t[2, 1] - t[0, 1])
-                c2 = t[0, 2] + v * (t[1, 2] - t[0, 2]) + w * (t[2, 2] - t[0, 2])
-                d2 = (p[0] - c0) ** 2 + (p[1] - c1) ** 2 + (p[2] - c2) ** 2
-                if d2 < best2:
-                    best2, best_triangle, best_feature = d2, i, feature
-                    best[0], best[1], best[2] = c0, c1, c2
+        if node < first_leaf:
+            first, second = 2 * node + 1, 2 * node + 2
+            left, right = _away2(p, low[first], high[first]), _away2(p, low[second], high[second])
+            if left < right:
+                first, second, left, right = second, first, right, left
+            if left < best2:
+                stack[size], bound[size] = first, left
+                size += 1
+            if right < best2:
+                stack[size], bound[size] = second, right
+                size += 1
             continue
-        left, right = 2 * node + 1, 2 * node + 2
-        d_left = _box_distance2(p, low[left], high[left])
-        d_right = _box_distance2(p, low[right], high[right])
-        if d_left < d_right:
-            left, right, d_left, d_right = right, left, d_right, d_left
-        if d_left < best2:
-            stack[size], bound[size] = left, d_left
-            size += 1
-        if d_right < best2:
-            stack[size], bound[size] = right, d_right
-            size += 1
+        t = corners[node - first_leaf]
+        v, w, feature = _closest_on_triangle(p, t)
+        c0 = t[0, 0] + v * (t[1, 0] - t[0, 0]) + w * (t[2, 0] - t[0, 0])
+        c1 = t[0, 1] + v * (t[1, 1] - t[0, 1]) + w * (t[2, 1] - t[0, 1])
+        c2 = t[0, 2] + v * (t[1, 2] - t[0, 2]) + w * (t[2, 2] - t[0, 2])
+        d2 = (p[0] - c0) ** 2 + (p[1] - c1) ** 2 + (p[2] - c2) ** 2
+        if d2 < best2:
+            best2, best_triangle, best_feature = d2, node - first_leaf, feature
+            best[0], best[1], best[2] = c0, c1, c2
     return best2, best_triangle, best_feature
 
 
@@ -385,36 +336,34 @@ def _closest_all(corners: Any, low: Any, high: Any, points: Any) -> tuple[Any, A
 def _inscribed_one(corners: Any, rise: Any, low: Any, high: Any, p: Any) -> float:
     """Return the distance of a point from the curved triangles."""
     first_leaf = low.shape[0] // 2
-    stack = np.zeros(_STACK, dtype=np.int32)
-    bound = np.zeros(_STACK)
-    size, best = 1, np.inf
+    stack, bound = np.zeros(_STACK, dtype=np.int32), np.zeros(_STACK)
+    size, best = min(1, len(corners)), np.inf
     while size > 0:
         size -= 1
         node = stack[size]
         if bound[size] >= best:
             continue
-        if node >= first_leaf:
-            start = (node - first_leaf) * LEAF
-            for i in range(start, min(start + LEAF, corners.shape[0])):
-                t = corners[i]
-                v, w, _ = closest_on_triangle(p, t)
-                u, d2 = 1.0 - v - w, 0.0
-                for k in range(3):
-                    d2 += (p[k] - u * t[0, k] - v * t[1, k] - w * t[2, k]) ** 2
-                bulge = 0.5 * (u * v * rise[i, 0] + v * w * rise[i, 1] + w * u * rise[i, 2])
-                best = min(best, np.sqrt(d2) + bulge)
+        if node < first_leaf:
+            first, second = 2 * node + 1, 2 * node + 2
+            left, right = _away2(p, low[first], high[first]), _away2(p, low[second], high[second])
+            left, right = np.sqrt(left), np.sqrt(right)
+            if left < right:
+                first, second, left, right = second, first, right, left
+            if left < best:
+                stack[size], bound[size] = first, left
+                size += 1
+            if right < best:
+                stack[size], bound[size] = second, right
+                size += 1
             continue
-        left, right = 2 * node + 1, 2 * node + 2
-        d_left = np.sqrt(_box_distance2(p, low[left], high[left]))
-        d_right = np.sqrt(_box_distance2(p, low[right], high[right]))
-        if d_left < d_right:
-            left, right, d_left, d_right = right, left, d_right, d_left
-        if d_left < best:
-            stack[size], bound[size] = left, d_left
-            size += 1
-        if d_right < best:
-            stack[size], bound[size] = right, d_right
-            size += 1
+        i = node - first_leaf
+        t = corners[i]
+        v, w, _ = _closest_on_triangle(p, t)
+        u, d2 = 1.0 - v - w, 0.0
+        for k in range(3):
+            d2 += (p[k] - u * t[0, k] - v * t[1, k] - w * t[2, k]) ** 2
+        bulge = 0.5 * (u * v * rise[i, 0] + v * w * rise[i, 1] + w * u * rise[i, 2])
+        best = min(best, np.sqrt(d2) + bulge)
     return best
 
 
@@ -444,64 +393,35 @@ def _entry(origin: Any, inverse: Any, low: Any, high: Any, node: int) -> float:
 
 
 @njit(cache=True)
-def ray_meets_triangle(o: Any, d: Any, t: Any) -> float:
-    """Return the parameter s at which the ray o + s d hits a triangle (3, 3), inf where it misses.
-
-    References
-    ----------
-    Moeller and Trumbore 1997.
-    """
-    e0, e1, e2 = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
-    f0, f1, f2 = t[2, 0] - t[0, 0], t[2, 1] - t[0, 1], t[2, 2] - t[0, 2]
-    h0, h1, h2 = d[1] * f2 - d[2] * f1, d[2] * f0 - d[0] * f2, d[0] * f1 - d[1] * f0
-    det = e0 * h0 + e1 * h1 + e2 * h2
-    if abs(det) < 1e-300:
-        return np.inf
-    s0, s1, s2 = o[0] - t[0, 0], o[1] - t[0, 1], o[2] - t[0, 2]
-    u = (s0 * h0 + s1 * h1 + s2 * h2) / det
-    q0, q1, q2 = s1 * e2 - s2 * e1, s2 * e0 - s0 * e2, s0 * e1 - s1 * e0
-    v = (d[0] * q0 + d[1] * q1 + d[2] * q2) / det
-    # The tolerance closes the seams between triangles: a ray through a shared edge must hit one of them.
-    if u < -1e-12 or v < -1e-12 or u + v > 1.0 + 1e-12:
-        return np.inf
-    s = (f0 * q0 + f1 * q1 + f2 * q2) / det
-    return s if s >= 0.0 else np.inf
-
-
-@njit(cache=True)
 def _first_hit_one(corners: Any, low: Any, high: Any, origin: Any, direction: Any, limit: float) -> tuple[float, int]:
     """Return the parameter of a ray's first hit, inf where there is none, and the triangle."""
     first_leaf = low.shape[0] // 2
     inverse = np.zeros(3)
     for k in range(3):
         inverse[k] = 1.0 / direction[k] if abs(direction[k]) > 1e-200 else 1e200
-    stack = np.zeros(_STACK, dtype=np.int32)
-    entry = np.zeros(_STACK)
-    size, best, hit = 1, np.inf, 0
+    stack, bound = np.zeros(_STACK, dtype=np.int32), np.zeros(_STACK)
+    size, best, hit = min(1, len(corners)), np.inf, 0
     while size > 0:
         size -= 1
         node = stack[size]
         # A hit at the face of a box must not be lost by rounding: boxes count as slightly nearer.
-        if entry[size] > min(best, limit) * (1.0 + 1e-12) + 1e-12:
+        if bound[size] > min(best, limit) * (1.0 + 1e-12) + 1e-12:
             continue
-        if node >= first_leaf:
-            start = (node - first_leaf) * LEAF
-            for i in range(start, min(start + LEAF, corners.shape[0])):
-                s = ray_meets_triangle(origin, direction, corners[i])
-                if s < best:
-                    best, hit = s, i
+        if node < first_leaf:
+            first, second = 2 * node + 1, 2 * node + 2
+            left, right = _entry(origin, inverse, low, high, first), _entry(origin, inverse, low, high, second)
+            if left < right:
+                first, second, left, right = second, first, right, left
+            if left < np.inf:
+                stack[size], bound[size] = first, left
+                size += 1
+            if right < np.inf:
+                stack[size], bound[size] = second, right
+                size += 1
             continue
-        left, right = 2 * node + 1, 2 * node + 2
-        t_left = _entry(origin, inverse, low, high, left)
-        t_right = _entry(origin, inverse, low, high, right)
-        if t_left < t_right:
-            left, right, t_left, t_right = right, left, t_right, t_left
-        if t_left < np.inf:
-            stack[size], entry[size] = left, t_left
-            size += 1
-        if t_right < np.inf:
-            stack[size], entry[size] = right, t_right
-            size += 1
+        s = ray_meets_triangle(origin, direction, corners[node - first_leaf])
+        if s < best:
+            best, hit = s, node - first_leaf
     return best, hit
 
 

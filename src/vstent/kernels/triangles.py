@@ -16,22 +16,17 @@ from vstent.kernels.arrays import Floats, Ints
 
 def areas(corners: Floats) -> Floats:
     """Return the areas (m,) of triangles (m, 3, 3)."""
-    return 0.5 * np.linalg.norm(_crosses(corners), axis=1)
+    return 0.5 * np.linalg.norm(_crosses(np.ascontiguousarray(corners, dtype=np.float64)), axis=1)
 
 
 def normals(corners: Floats) -> Floats:
     """Return the unit normals (m, 3) of triangles (m, 3, 3); zero for degenerate ones."""
-    cross = _crosses(corners)
+    cross = _crosses(np.ascontiguousarray(corners, dtype=np.float64))
     return cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300)
 
 
-def _crosses(corners: Floats) -> Floats:
-    """Return the cross product (m, 3) of two edges of each triangle."""
-    return _cross_all(np.ascontiguousarray(corners, dtype=np.float64))
-
-
 @njit(cache=True)
-def _cross_all(corners: Any) -> Any:
+def _crosses(corners: Any) -> Any:
     """Return the cross product (m, 3) of two edges of each triangle."""
     cross = np.zeros((len(corners), 3))
     for f in range(len(corners)):
@@ -49,12 +44,7 @@ def volume(corners: Floats) -> float:
 
 
 def vertex_normals(vertices: Floats, faces: Ints) -> Floats:
-    """Return unit normals (n, 3) at the vertices, weighted by the angles of the triangles.
-
-    References
-    ----------
-    Baerentzen and Aanaes 2005, IEEE TVCG 11(3), eq. 5.
-    """
+    """Return unit normals (n, 3) weighted by the triangles' angles (Baerentzen and Aanaes 2005, IEEE TVCG 11(3))."""
     corners = np.ascontiguousarray(vertices[faces], dtype=np.float64)
     total = _angle_weighted(corners, np.ascontiguousarray(faces), normals(corners), len(vertices))
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
@@ -77,13 +67,9 @@ def _angle_weighted(corners: Any, faces: Any, normal: Any, n_vertices: int) -> A
 
 
 def smooth_normals(vertices: Floats, faces: Ints) -> Floats:
-    """Return unit normals (n, 3) of the smooth surface that a mesh samples.
+    """Return unit normals (n, 3) of the smooth surface that a mesh samples (Max 1999, J. Graph. Tools 4(2):1, eq. 2).
 
     They are exact for vertices on a sphere, and more accurate on a third-order surface than angle-weighted normals.
-
-    References
-    ----------
-    Max 1999, J. Graph. Tools 4(2):1, eq. 2.
     """
     total = _max_weighted(np.ascontiguousarray(vertices[faces], dtype=np.float64), faces, len(vertices))
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
@@ -207,47 +193,79 @@ def compact(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
 
 
 def clip(vertices: Floats, faces: Ints, level: Floats) -> tuple[Floats, Ints, Floats]:
-    """Return the part of a mesh where `level` is negative; faces are cut along level 0.
+    """Return the part of a mesh where `level` (n,) is negative, with its level; faces are cut along level 0.
 
-    Parameters
-    ----------
-    vertices, faces : (n, 3), (m, 3); the mesh.
-    level : (n,); value at every vertex, linear along edges.
-
-    Returns
-    -------
-    vertices : (k, 3); Vertices; faces next to each other share those of the cut.
-    faces : (j, 3); faces.
-    level : (k,); level at these vertices.
+    The level is linear along edges, and faces next to each other share the vertices of the cut.
     """
     level = np.where(np.abs(level) < 1e-12, 1e-12, level)
-    inside = level < 0
-    count = inside[faces].sum(axis=1)
-    whole = faces[count == 3]
-    pieces = [whole]
-    cut_edges: list[Ints] = []
-    for n_inside in (1, 2):
-        part = faces[count == n_inside]
-        odd = inside[part] if n_inside == 1 else ~inside[part]
-        rolled = np.take_along_axis(part, (odd.argmax(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
-        a, b, c = rolled.T
-        cut_edges.append(np.stack([np.stack([a, b], 1), np.stack([a, c], 1)], axis=1))
-        pieces.append(rolled)
-    ends = np.concatenate([edges.reshape(-1, 2) for edges in cut_edges])
-    unique, inverse = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True)
-    number = (len(vertices) + inverse.ravel()).astype(np.int32).reshape(-1, 2)
-    u, v = unique.T
-    t = (level[u] / (level[u] - level[v]))[:, None] if len(unique) else np.zeros((0, 1))
-    points = np.concatenate([vertices, vertices[u] + t * (vertices[v] - vertices[u])])
-    levels = np.concatenate([level, np.zeros(len(unique))])
-    n_single = len(pieces[1])
-    single, double = number[:n_single], number[n_single:]
-    corner = np.stack([pieces[1][:, 0], single[:, 0], single[:, 1]], axis=1)
-    _, b, c = pieces[2].T
-    quad = [np.stack([double[:, 0], b, c], axis=1), np.stack([double[:, 0], c, double[:, 1]], axis=1)]
-    kept = np.concatenate([whole, corner, *quad]).astype(np.int32)
+    inside = level[faces] < 0
+    count = inside.sum(axis=1)
+    single, double = faces[count == 1], faces[count == 2]
+    a = _rotated(single, inside[count == 1].argmax(axis=1))
+    b = _rotated(double, inside[count == 2].argmin(axis=1))
+    points, crossing = _crossings(
+        vertices, np.concatenate([a[:, [0, 1]], a[:, [0, 2]], b[:, [0, 1]], b[:, [0, 2]]]), level
+    )
+    n, m = len(a), len(b)
+    a1, a2, b1, b2 = np.split(crossing, [n, 2 * n, 2 * n + m])
+    corners = np.stack([a[:, 0], a1, a2], axis=1)
+    quads = [np.stack([b1, b[:, 1], b[:, 2]], axis=1), np.stack([b1, b[:, 2], b2], axis=1)]
+    kept = np.concatenate([faces[count == 3], corners, *quads]).astype(np.int32)
     used, renumbered = np.unique(kept, return_inverse=True)
+    levels = np.concatenate([level, np.zeros(len(points) - len(level))])
     return points[used], renumbered.reshape(kept.shape).astype(np.int32), levels[used]
+
+
+def cut(vertices: Floats, faces: Ints, value: Floats) -> tuple[Floats, Ints]:
+    """Return the part of a mesh where a value (n,), linear on every face, is at most 0.
+
+    Faces share the vertices of the cut. Vertices that no face uses any more stay in the list.
+    """
+    positive = value[faces] > 0
+    count = positive.sum(axis=1)
+    one, two = faces[count == 1], faces[(count == 2) & (value[faces].min(axis=1) < 0)]
+    a = _rotated(one, np.argmax(value[one] > 0, axis=1))
+    b = _rotated(two, np.argmin(value[two] > 0, axis=1))
+    vertices, crossing = _crossings(
+        vertices, np.concatenate([a[:, [0, 1]], a[:, [0, 2]], b[:, [0, 1]], b[:, [0, 2]]]), value
+    )
+    a1, a2, b1, b2 = np.split(crossing, [len(a), 2 * len(a), 2 * len(a) + len(b)])
+    quads = [np.stack([a[:, 1], a[:, 2], a2], axis=1), np.stack([a[:, 1], a2, a1], axis=1)]
+    made = np.concatenate([*quads, np.stack([b[:, 0], b1, b2], axis=1)])
+    sound = (made[:, 0] != made[:, 1]) & (made[:, 1] != made[:, 2]) & (made[:, 2] != made[:, 0])
+    return vertices, np.concatenate([faces[count == 0], made[sound]]).astype(np.int32)
+
+
+def section(vertices: Floats, faces: Ints, value: Floats) -> Floats:
+    """Return the segments (s, 2, 3) along which a mesh meets the zero of `value` (n,), linear on every face."""
+    is_positive = value[faces] > 0
+    count = is_positive.sum(axis=1)
+    one = _rotated(faces[count == 1], np.argmax(is_positive[count == 1], axis=1))
+    lone = np.concatenate([one, _rotated(faces[count == 2], np.argmin(is_positive[count == 2], axis=1))])
+    a, b = lone[:, :1], lone[:, 1:]
+    share = (value[a] / (value[a] - value[b]))[..., None]
+    return np.asarray(vertices[a] + share * (vertices[b] - vertices[a]))
+
+
+def _rotated(faces: Ints, start: Ints) -> Ints:
+    """Return every face rotated so that its corner number `start` comes first."""
+    return np.take_along_axis(faces, (start[:, None] + np.arange(3)) % 3, axis=1)
+
+
+def _crossings(vertices: Floats, edges: Ints, value: Floats) -> tuple[Floats, Ints]:
+    """Return vertices with one more per edge whose ends differ in sign, and its number for every edge (k,).
+
+    For an edge with an end at zero, the number is that of this end.
+    """
+    low, high = edges.min(axis=1), edges.max(axis=1)
+    on_zero = (value[low] == 0) | (value[high] == 0)
+    code, inverse = np.unique(low.astype(np.int64) * len(vertices) + high, return_inverse=True)
+    a, b = code // len(vertices), code % len(vertices)
+    span = np.where(value[a] == value[b], 1.0, value[a] - value[b])
+    t = np.clip(value[a] / span, 0.0, 1.0)[:, None]
+    created = vertices[a] + t * (vertices[b] - vertices[a])
+    answer = np.where(on_zero, np.where(value[low] == 0, low, high), len(vertices) + inverse)
+    return np.concatenate([vertices, created]), answer.astype(np.int32)
 
 
 def components(faces: Ints, n_vertices: int) -> Ints:
@@ -261,26 +279,11 @@ def joined(pairs: Ints, n: int) -> Ints:
     return connected_components(graph, directed=False)[1].astype(np.int32)
 
 
-def face_neighbours(faces: Ints) -> Ints:
-    """Return pairs (k, 2) of faces that share an edge; more than two faces at an edge are paired in a chain."""
-    edges = np.sort(directed_edges(faces), axis=1).astype(np.int64)
-    key = edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1]
-    order = np.argsort(key, kind="stable")
-    same = key[order][1:] == key[order][:-1]
-    owner = np.tile(np.arange(len(faces)), 3)[order]
-    return np.stack([owner[:-1][same], owner[1:][same]], axis=1).astype(np.int32)
-
-
 def sample(vertices: Floats, faces: Ints, most: int = 30_000, coarsest: float = 0.4) -> tuple[Floats, Floats]:
     """Return evenly spaced points (k, 3) on a surface and its normals (k, 3) there.
 
-    Every point is a vertex or lies on a face; one is kept per cube of the spacing.
-
-    Parameters
-    ----------
-    vertices, faces : (n, 3), (m, 3); the surface.
-    most : approximate maximum number of points; it limits how small the spacing is.
-    coarsest : spacing wanted; limited to between one and two times the spacing at which there are `most` points.
+    Every point is a vertex or lies on a face; one is kept per cube of the spacing. The spacing is `coarsest`, limited
+    to between one and two times that at which there are `most` points.
     """
     corners = vertices[faces]
     even = float(np.sqrt(areas(corners).sum() / most))

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from vstent.io.files import atomic, state_of
-from vstent.kernels.cache import kept_in
+from vstent.kernels.cache import cache_folder
 from vstent.study.store import UNREADABLE, digest
 
 PACKAGE: Final = Path(__file__).parents[1]
@@ -48,7 +48,7 @@ def code_of(entry: str, without: tuple[str, ...] = ()) -> str:
         _, found[name], imports = memory[name]
         todo += imports
     if is_new:
-        with suppress(OSError), atomic(kept_in(PACKAGE) / REMEMBERED) as partial:
+        with suppress(OSError), atomic(cache_folder(PACKAGE) / REMEMBERED) as partial:
             partial.write_text(json.dumps(memory))
     return digest(sorted(found.items()))
 
@@ -57,7 +57,7 @@ def code_of(entry: str, without: tuple[str, ...] = ()) -> str:
 def _memory() -> dict[str, list[Any]]:
     """Return what is remembered of modules and functions by name: state of the file, digest and imports."""
     with suppress(*UNREADABLE):
-        found = json.loads((kept_in(PACKAGE) / REMEMBERED).read_text())
+        found = json.loads((cache_folder(PACKAGE) / REMEMBERED).read_text())
         return {str(name): [state, str(tree), list(imports)] for name, (state, tree, imports) in found.items()}
     return {}
 

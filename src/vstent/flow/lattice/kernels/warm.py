@@ -10,13 +10,13 @@ from functools import cache
 import numpy as np
 
 from vstent.flow.lattice.kernels import d3q19, lanes
-from vstent.kernels.first_use import kept
+from vstent.kernels.first_use import ensure_cached
 
 
 @cache
 def keep_flow() -> None:
     """Make sure that numba's cache holds the kernels of a flow; another process compiles those that are missing."""
-    kept(flow, (sys.executable, "-c", f"from {__name__} import flow; flow()"))
+    ensure_cached(flow, (sys.executable, "-c", f"from {__name__} import flow; flow()"))
 
 
 def flow() -> None:
