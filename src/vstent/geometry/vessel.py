@@ -165,6 +165,8 @@ class NeckPlane:
     """(k, 3) closed curve in which it cuts the wall (the last point joins the first)."""
     area_band_mm2: tuple[float, float]
     """Smallest and largest area of the sections by planes that separate them nearly as well."""
+    bulge_fraction: float = 1.0
+    """Fraction of the wall that rises above the arteries which is beyond the plane."""
 
     def __post_init__(self) -> None:
         freeze(self, "normal", np.float64, (3,))

@@ -22,6 +22,8 @@ NEAR_SAC_MM: Final = 4.0
 UNCERTAIN: Final = 1.25
 """A neck is reported as uncertain where the largest area of nearly as good planes exceeds the smallest by this
 factor."""
+WHOLE: Final = 0.7
+"""A neck is reported as uncertain where less than this fraction of the bulge's wall is in the sac."""
 STENOSED: Final = 0.7
 """A stenosis is reported where the width beside a neck is below this fraction of the widths on both sides of it."""
 STENOSED_REACH: Final = 2.0
@@ -66,19 +68,28 @@ def told(
 
 
 def _neck(aneurysm: Aneurysm) -> list[str]:
-    """Return a note on a sac whose neck is cut by an uncertain plane, or that has no plane."""
+    """Return notes on a sac whose neck is cut by an uncertain plane, or that has no plane."""
     if aneurysm.plane is None:
         return [
             f"No plane separates the sac at {place(aneurysm.neck_mm.mean(axis=0))} from all arteries. Its heights, "
             "widths and volume by plane refer to the mean plane of its neck curve."
         ]
     low_mm2, high_mm2 = aneurysm.plane.area_band_mm2
-    if high_mm2 <= UNCERTAIN * low_mm2 or not np.array_equal(aneurysm.neck_mm, aneurysm.plane.rim_mm):
-        return []
-    return [
-        f"The neck is uncertain: its area is {aneurysm.plane.area_mm2:.1f} mm2, and {low_mm2:.1f} to "
-        f"{high_mm2:.1f} mm2 for planes that separate the sac nearly as well."
-    ]
+    notes: list[str] = []
+    if not np.array_equal(aneurysm.neck_mm, aneurysm.plane.rim_mm):
+        return notes
+    if high_mm2 > UNCERTAIN * low_mm2:
+        notes.append(
+            f"The neck is uncertain: its area is {aneurysm.plane.area_mm2:.1f} mm2, and {low_mm2:.1f} to "
+            f"{high_mm2:.1f} mm2 for planes that separate the sac nearly as well."
+        )
+    if aneurysm.plane.bulge_fraction < WHOLE:
+        notes.append(
+            f"The neck is uncertain: {1 - aneurysm.plane.bulge_fraction:.0%} of the wall that bulges at "
+            f"{place(aneurysm.neck_mm.mean(axis=0))} is outside the sac: a lobe of it, or the stump of a branch. Look "
+            "at the neck, and draw it by hand if a lobe is cut off (--neck)."
+        )
+    return notes
 
 
 def _before_another(vessel: Vessel, path: int, bulges: list[Bulge]) -> list[str]:

@@ -26,7 +26,7 @@ REACH: Final = 2.0
 """Wall farther from the bulge than this many radii of the artery there is beyond the neck; arteries are open there."""
 THIN: Final = 0.55
 """A branch thinner than this fraction of the artery may arise from the sac: it does not have to be outside."""
-LEAST_SHARE: Final = 0.4
+LEAST_SHARE: Final = 0.5
 """Smallest fraction of the bulge's wall in a sac; with less the plane cuts off a lobe."""
 TILT_RAD: Final = np.radians(80.0)
 """Largest angle in rad between the normal of a plane and the direction from the bulge's foot to its middle."""
@@ -86,7 +86,9 @@ def plane_sac(lumen: Surface, tubes: Tubes, bulge: Bulge) -> Aneurysm | None:
             without = _best(_wall(fields, faces, 0.0, bulge), bulge)
             area_mm2 = area_mm2 if without is None else np.append(area_mm2, without[2][1])
         sac, neck = cut_at(wall, point, normal)
-        plane = NeckPlane(normal, neck.vertices_mm[:-1], (float(area_mm2.min()), float(area_mm2.max())))
+        share = measures[BULGE] / wall.sheet.terms[:, 2 + BULGE].sum()
+        band_mm2 = float(area_mm2.min()), float(area_mm2.max())
+        plane = NeckPlane(normal, neck.vertices_mm[:-1], band_mm2, float(share))
         return Aneurysm(sac, neck, plane.rim_mm, plane)
     return None
 
