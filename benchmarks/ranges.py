@@ -3,7 +3,7 @@
 Run from the repository: ``python benchmarks/ranges.py [CASE ...]`` (demo C0038). All numbers of a device lie anywhere
 in their ranges in 128 deployments. Every column holds the width of the band over the width of the interval of these
 deployments, and the largest distance of an end from the interval's, over the width; "-" where both have no width. The
-time is the processor time of one band, without and with the search of the sizes at its ends.
+time is the processor time of the bands, without and with the search of the sizes at their ends, and of the bands of gaps.
 """
 
 import sys
@@ -26,7 +26,7 @@ from vstent.devices.stent import Landing
 from vstent.errors import VstentError
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.surfaces import read_surface
-from vstent.plan.bands import Band, bands, interval
+from vstent.plan.bands import Band, bands, gap_bands, interval
 from vstent.plan.shares import centered_points
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -65,6 +65,9 @@ def row(artery: Anatomy, design: Design) -> str:
     alone_s = time.process_time() - began
     bands(artery, lies, measures, is_proposed=True)
     with_sizes_s = time.process_time() - began - alone_s
+    began = time.process_time()
+    found |= gap_bands(artery, lies, measures)
+    gaps_s = time.process_time() - began
     ranges = uncertain(design)
     sampled = []
     for point in centered_points(len(ranges), SAMPLES):
@@ -77,7 +80,7 @@ def row(artery: Anatomy, design: Design) -> str:
         _cell(found.get(key), [float(one[key]) for one in sampled if key in one], float(measures.get(key, np.nan)))
         for key in SHOWN
     ]
-    return f"| {design.name} {size.label} | {' | '.join(cells)} | {alone_s:.2f}, {with_sizes_s:.2f} |"
+    return f"| {design.name} {size.label} | {' | '.join(cells)} | {alone_s:.2f}, {with_sizes_s:.2f}, {gaps_s:.2f} |"
 
 
 def _cell(band: Band | None, values: list[float], value: float) -> str:

@@ -16,12 +16,13 @@ from vstent.devices.catalogue import catalogue, find_design, find_size
 from vstent.devices.ranges import MARGIN, altered, uncertain, values_at
 from vstent.devices.stent import Landing
 from vstent.errors import VstentError
-from vstent.plan.bands import BANDED, INTERVAL, SAMPLES, bands, interval, length_band
+from vstent.plan.bands import INTERVAL, SAMPLES, bands, gap_bands, interval, length_band
 from vstent.plan.rank import rank
 from vstent.plan.shares import centered_points
 from vstent.reporting.uncertainty import band_rows, ends, how_sure, number_name
 
 SILK = find_design("silk")
+ENTERPRISE = find_design("enterprise")
 SIZE = find_size(SILK, diameter_mm=4, length_mm=15)
 RADIUS_MM = 1.9
 MIDDLE_MM = 16.0
@@ -64,7 +65,8 @@ def test_in_a_straight_tube_the_band_is_that_of_the_closed_formulas():
 
 def test_the_ends_move_as_the_length_and_shares_name_what_moves_it():
     found = bands(straight(), *lying()).results
-    length, first, last = (found[name] for name in BANDED[:3])
+    ends = ("proximal_end_abscissa_mm", "distal_end_abscissa_mm")
+    length, first, last = (found[name] for name in ("deployed_length_mm", *ends))
     assert first.high - first.low + last.high - last.low == pytest.approx(length.high - length.low, rel=0.02)
     assert first.low < MIDDLE_MM < last.high
     assert set(length.shares) <= {one.name for one in uncertain(SILK)}
@@ -90,8 +92,8 @@ def test_a_braid_in_a_wide_artery_stands_off_by_half_of_what_its_free_diameter_l
     (one,) = (one for one in SILK.ranges if one.name == MARGIN)
     only = replace(SILK, ranges=(one,))
     deployment, measures = lying(radius_mm)
-    found = bands(straight(radius_mm), replace(deployment, stent=replace(deployment.stent, design=only)), measures)
-    gap = found.results["max_wall_gap_mm"]
+    of_margin = replace(deployment, stent=replace(deployment.stent, design=only))
+    gap = gap_bands(straight(radius_mm), of_margin, measures)["max_wall_gap_mm"]
     at = [one.low + share * (one.high - one.low) for share in reversed(INTERVAL)]
     wanted = [measures["max_wall_gap_mm"] - 0.5 * (value - one.value) for value in at]
     assert (gap.low, gap.high) == pytest.approx(wanted, abs=0.01)
@@ -129,6 +131,7 @@ def test_a_device_whose_numbers_are_exact_has_no_bands():
     bare = replace(deployment, stent=replace(deployment.stent, design=replace(SILK, ranges=())))
     assert bands(straight(), bare, measures).metrics() == {"results": {}}
     assert length_band(straight(), bare, measures) is None
+    assert gap_bands(straight(), bare, measures) == {}
     told = {"deployment": measures, "bands": {"results": {}, "device": "Numbers of X: 3 cited."}}
     assert how_sure(told) == "Numbers of X: 3 cited."
     assert band_rows(told) == []
@@ -202,7 +205,8 @@ def compared(key, count):
     size = min(design.sizes, key=lambda one: (abs(one.diameter_mm - 3.75), one.length_mm))
     landing = Landing(0.5 * bent().parent.axis.length_mm)
     deployment = deploy(design, bent(), size=size, landing=landing)
-    found = bands(bent(), deployment, measure(bent(), deployment)).results
+    measures = measure(bent(), deployment)
+    found = bands(bent(), deployment, measures).results | gap_bands(bent(), deployment, measures)
     others = sampled(design, size, landing, count)
     widths = {name: np.ptp(np.quantile([float(one[name]) for one in others], INTERVAL)) for name in found}
     return {name: (found[name].high - found[name].low) / width for name, width in widths.items() if width > 1e-3}
@@ -212,6 +216,22 @@ def test_in_a_bend_the_band_of_the_length_is_that_of_full_deployments():
     ratios = compared("lvis", 16)
     # 16 deployments leave out a part of the ends that 128 samples have
     assert ratios["deployed_length_mm"] == pytest.approx(1.0, abs=0.25)
+
+
+def test_bands_of_gaps_are_those_of_deployments_in_any_process():
+    design = replace(ENTERPRISE, ranges=tuple(one for one in ENTERPRISE.ranges if one.name != "n_columns"))
+    size, landing = find_size(design, length_mm=14), Landing(0.5 * bent().parent.axis.length_mm)
+    deployment = deploy(design, bent(), size=size, landing=landing)
+    measures = measure(bent(), deployment)
+    found = gap_bands(bent(), deployment, measures, jobs=2)
+    others = sampled(design, size, landing, 32)
+    assert len(others) == 32
+    for name, band in found.items():
+        ends = np.quantile([one[name] for one in others], INTERVAL)
+        assert (band.low, band.high) == (min(ends[0], measures[name]), max(ends[1], measures[name]))
+        assert band.high - band.low > 0.1
+    assert set(found) == {"apposed_fraction", "max_wall_gap_mm"}
+    assert max(found["max_wall_gap_mm"].shares.values()) > 0.3
 
 
 @pytest.mark.validation

@@ -2,11 +2,11 @@
 
 Makers publish few numbers, so the catalogue states a range for each (`vstent.devices.ranges`). All numbers of a device
 are sampled together, each uniformly in its range and independently of the others. The band of a result contains 95 % of
-the samples and the result itself. Full deployments of all samples would take a minute; a reduced model
-(`vstent.plan.reduced`) takes a fraction of a second. ``benchmarks/ranges.py`` compares the two.
+the samples and the result itself. A reduced model (`vstent.plan.reduced`) stands for the deployments, except for gaps:
+these come from deployments, which take a few seconds. ``benchmarks/ranges.py`` compares both with more deployments.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -14,35 +14,28 @@ from typing import Any, Final
 import numpy as np
 
 from vstent.anatomy.morphology import Measures
-from vstent.deployment.deploy import APPOSED_GAP_MM, propose_size
-from vstent.devices.design import Design, LaserCut, Range, Size
+from vstent.deployment.deploy import deploy, propose_size
+from vstent.deployment.measure import apposition
+from vstent.devices.design import Design, Range, Size
 from vstent.devices.ranges import altered, altered_size, uncertain, values_at
-from vstent.devices.stent import Deployment
+from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import DeviceError, LandingError
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Floats
-from vstent.plan.cells_in_bends import GAPS, NECK, plane
-from vstent.plan.reduced import Changed, Reduced
+from vstent.plan.bends import NECK, crowding, shortening
+from vstent.plan.reduced import Reduced
 from vstent.plan.shares import centered_points, first_order_shares
-from vstent.plan.shortening import shortening
+from vstent.plan.workers import spread
 
 LENGTH: Final = "deployed_length_mm"
 """Name of the deployed length."""
-BANDED: Final[tuple[str, ...]] = (
-    LENGTH,
-    "proximal_end_abscissa_mm",
-    "distal_end_abscissa_mm",
-    "neck_to_proximal_end_mm",
-    "neck_to_distal_end_mm",
-    "mesh_length_mm",
-    *NECK,
-    *GAPS,
-)
-"""Measures of a deployment that have a band."""
+GAPS: Final = ("apposed_fraction", "max_wall_gap_mm")
+"""Measures of gaps that have a band."""
 SAMPLES: Final = 128
 """Number of samples; a power of two."""
 FEW_SAMPLES: Final = 32
-"""Number of samples for the band of the deployed length alone; a power of two."""
+"""Number of samples for the band of the deployed length alone, and number of deployments for those of the gaps; a power
+of two."""
 INTERVAL: Final = (0.025, 0.975)
 """Quantiles at the ends of a band: 95 % of the samples lie in it."""
 
@@ -80,32 +73,61 @@ class Bands:
 
 
 def bands(anatomy: Anatomy, deployment: Deployment, measures: Measures, *, is_proposed: bool = False) -> Bands:
-    """Compute the bands of a deployment from the ranges of its device.
+    """Compute the bands of a deployment from the ranges of its device, without those of its gaps (`gap_bands`).
 
-    Parameters
-    ----------
-    deployment : the deployed device. Its middle row stays where it is.
-    measures : results of `vstent.deployment.measure.measure`.
-    is_proposed : whether to find also the sizes that would be proposed at both ends of the band of the deployed
-        length.
-
-    Returns bands of the results in `BANDED` that are measured; none for a device without ranges.
+    Its middle row stays where it is. With `is_proposed` the sizes are found that would be proposed at both ends of the
+    band of the deployed length. There are no bands without ranges.
     """
-    stent = deployment.stent
-    ranges = uncertain(stent.design)
+    design, ranges = deployment.stent.design, uncertain(deployment.stent.design)
     if not ranges:
         return Bands({})
-    points = centered_points(len(ranges), SAMPLES)
-    samples = _samples(anatomy, deployment, measures, _devices(deployment, ranges, points))
-    results: dict[str, Band] = {
-        name: _band(points, samples[name], float(measures[name]), ranges) for name in BANDED if name in samples
-    }
-    if not is_proposed:
-        return Bands(results)
-    order = np.argsort(samples[LENGTH])
-    ends = order[[round(quantile * (len(points) - 1)) for quantile in INTERVAL]]
-    sizes = (_proposed(stent.design, anatomy, values_at(ranges, points[end])) for end in ends)
-    return Bands(results, tuple(dict.fromkeys(size for size in sizes if size is not None)))
+    points, model = centered_points(len(ranges), SAMPLES), Reduced(anatomy, deployment)
+    devices = _devices(deployment.stent, ranges, points)
+    if design.follows_bends:
+        model = replace(model, shortening=shortening(anatomy, deployment.stent, ranges, model.landing))
+    samples = model.results(measures, devices)
+    if not design.follows_bends and NECK[0] in measures:
+        crowded = crowding(anatomy, deployment.stent, measures, ranges, model.landing)
+        at = [crowded(other) for other, _ in devices]
+        samples |= {name: np.array([one[name] for one in at]) for name in at[0]}
+    results = {name: _band(points, values, float(measures[name]), ranges) for name, values in samples.items()}
+    sizes: dict[Size, None] = {}
+    if is_proposed:
+        order = np.argsort(samples[LENGTH])
+        for end in order[[round(quantile * (len(points) - 1)) for quantile in INTERVAL]]:
+            with suppress(DeviceError, LandingError):
+                values = values_at(ranges, points[end])
+                originals = {altered_size(size, values): size for size in design.sizes}
+                sizes[originals[propose_size(design.altered(values, tuple(originals)), anatomy)]] = None
+    return Bands(results, tuple(sizes))
+
+
+def gap_bands(anatomy: Anatomy, deployment: Deployment, measures: Measures, *, jobs: int = 1) -> dict[str, Band]:
+    """Compute the bands of a deployment's gaps from deployments at places in the ranges, on `jobs` processes.
+
+    With `jobs` above 1 no loop is compiled or run in this process. Devices that cannot be made or do not fit the artery
+    are left out.
+    """
+    stent, ranges = deployment.stent, uncertain(deployment.stent.design)
+    if not ranges or GAPS[0] not in measures:
+        return {}
+    points = centered_points(len(ranges), FEW_SAMPLES)
+    common = anatomy, stent, Reduced(anatomy, deployment).landing
+    rows = list(spread(_gaps, common, [values_at(ranges, point) for point in points], jobs=jobs))
+    is_found = np.array([GAPS[0] in row for row in rows])
+    if not is_found.any():
+        return {}
+    samples = {name: np.array([float(row[name]) for row in rows if name in row]) for name in GAPS}
+    return {name: _band(points[is_found], samples[name], float(measures[name]), ranges) for name in GAPS}
+
+
+def _gaps(common: tuple[Anatomy, Stent, Landing], values: Mapping[str, float]) -> Measures:
+    """Return the apposition of a device with other values of its numbers; empty where it is not deployed."""
+    anatomy, stent, landing = common
+    with suppress(DeviceError, LandingError):
+        design, size = altered(stent.design, stent.size, values)
+        return apposition(anatomy, deploy(design, anatomy, size=size, landing=landing))
+    return {}
 
 
 def length_band(anatomy: Anatomy, deployment: Deployment, measures: Measures) -> Band | None:
@@ -114,61 +136,13 @@ def length_band(anatomy: Anatomy, deployment: Deployment, measures: Measures) ->
     if not ranges:
         return None
     points = centered_points(len(ranges), FEW_SAMPLES)
-    samples = _reduced(Reduced(anatomy, deployment), measures, _devices(deployment, ranges, points))
+    samples = Reduced(anatomy, deployment).results(measures, _devices(deployment.stent, ranges, points))
     return _band(points, samples[LENGTH], float(measures[LENGTH]), ranges)
 
 
-def _devices(deployment: Deployment, ranges: tuple[Range, ...], points: Floats) -> list[tuple[Design, Size]]:
+def _devices(stent: Stent, ranges: tuple[Range, ...], points: Iterable[Floats]) -> list[tuple[Design, Size]]:
     """Return the altered device and its size at every point (n, d) of its ranges."""
-    stent = deployment.stent
     return [altered(stent.design, stent.size, values_at(ranges, point)) for point in points]
-
-
-def _samples(
-    anatomy: Anatomy, deployment: Deployment, measures: Measures, devices: list[tuple[Design, Size]]
-) -> dict[str, Floats]:
-    """Return the results (n,) of altered devices by name."""
-    stent, ranges = deployment.stent, uncertain(deployment.stent.design)
-    model = Reduced(anatomy, deployment)
-    if not isinstance(stent.design, LaserCut):
-        model = replace(model, shortening=shortening(anatomy, stent, ranges, model.landing).change)
-    found = _reduced(model, measures, devices)
-    if isinstance(stent.design, LaserCut) and GAPS[0] in measures:
-        fit = plane(anatomy, stent, measures, ranges, model.landing)
-        fitted = [fit.at(design) for design, _ in devices if isinstance(design, LaserCut)]
-        found |= {name: np.array([one[name] for one in fitted]) for name in fit.names}
-    return found
-
-
-def _reduced(model: Reduced, measures: Measures, devices: list[tuple[Design, Size]]) -> dict[str, Floats]:
-    """Return the results (n,) of altered devices by name, from the reduced model alone."""
-    stent = model.deployment.stent
-    nominal = model.changed(stent.design, stent.size)
-    moved = [_moved(measures, nominal, model.changed(*device)) for device in devices]
-    return {name: np.array([one[name] for one in moved]) for name in moved[0]}
-
-
-def _moved(measures: Measures, nominal: Changed, other: Changed) -> dict[str, float]:
-    """Return the measured results, changed as the reduced model changes."""
-    first_mm, last_mm = other.first_mm - nominal.first_mm, other.last_mm - nominal.last_mm
-    moves = {
-        LENGTH: last_mm - first_mm,
-        "proximal_end_abscissa_mm": first_mm,
-        "distal_end_abscissa_mm": last_mm,
-        "neck_to_proximal_end_mm": nominal.mesh_first_mm - other.mesh_first_mm,
-        "neck_to_distal_end_mm": other.mesh_last_mm - nominal.mesh_last_mm,
-    }
-    moves["mesh_length_mm"] = moves["neck_to_proximal_end_mm"] + moves["neck_to_distal_end_mm"]
-    factors = {
-        NECK[0]: other.coverage_fraction / nominal.coverage_fraction,
-        NECK[1]: other.pore_density_per_mm2 / nominal.pore_density_per_mm2,
-    }
-    found = {name: float(measures[name]) + move for name, move in moves.items() if name in measures}
-    found |= {name: float(measures[name]) * by for name, by in factors.items() if name in measures and by == by}
-    if GAPS[0] in measures:
-        is_apposed = other.gap_mm < APPOSED_GAP_MM
-        found |= {GAPS[0]: float(is_apposed.mean()), GAPS[1]: float(other.gap_mm.max())}
-    return found
 
 
 def interval(samples: Floats, value: float) -> tuple[float, float]:
@@ -183,11 +157,3 @@ def _band(points: Floats, values: Floats, value: float, ranges: tuple[Range, ...
     shares = first_order_shares(points, values)
     named = zip((one.name for one in ranges), [] if shares is None else shares.tolist(), strict=False)
     return Band(low, high, dict(sorted(((k, v) for k, v in named if v > 0), key=lambda kv: -kv[1])))
-
-
-def _proposed(design: Design, anatomy: Anatomy, values: Mapping[str, float]) -> Size | None:
-    """Return the size of the catalogue that is proposed for a device with other numbers; None where none fits."""
-    with suppress(DeviceError, LandingError):
-        original = {altered_size(size, values): size for size in design.sizes}
-        return original[propose_size(design.altered(values, tuple(original)), anatomy)]
-    return None
