@@ -81,7 +81,7 @@ def test_the_report_finds_the_films_of_a_case(tmp_path):
     kept = kept_films(tmp_path)
     assert kept.animation == (tmp_path / "angiogram" / "angiogram.webp").read_bytes()
     assert [one.id for one in kept.pictures] == ["key_frames", "density"]
-    assert kept.pictures[0].png == key_frames([*shown.values()], shown["bare"].film.most).png
+    assert kept.pictures[0].png == key_frames([*shown.values()], float(shown["bare"].film.absorption.max())).png
     (tmp_path / "angiogram" / "angiogram.webp").write_bytes(bytes(3_000_000))
     assert kept_films(tmp_path).animation == b""  # too large for the report
 

@@ -25,9 +25,7 @@ class Curves:
     """(t,) in the parent artery proximal to the neck."""
 
     def __post_init__(self) -> None:
-        freeze(self, "time_s", np.float64, (-1,))
-        freeze(self, "sac_mg_mL", np.float64, (len(self.time_s),))
-        freeze(self, "parent_mg_mL", np.float64, (len(self.time_s),))
+        freeze(self, "time_s sac_mg_mL parent_mg_mL", np.float64, (len(self.time_s),))
 
     def measures(self) -> dict[str, float]:
         """Return the times of the curves, in s; those that the curves do not reach are left out.

@@ -60,11 +60,6 @@ class Film:
         """Frames per second."""
         return (len(self.time_s) - 1) / float(self.time_s[-1] - self.time_s[0]) if len(self.time_s) > 1 else 1.0
 
-    @property
-    def most(self) -> float:
-        """Largest absorption of all frames."""
-        return float(self.absorption.max(initial=0.0))
-
     def at(self, time_s: float) -> int:
         """Return the number of the frame nearest to a time."""
         return int(np.argmin(np.abs(self.time_s - time_s)))
@@ -156,4 +151,4 @@ def levels_of(
 
 def window_of(films: Sequence[Film]) -> float:
     """Return the absorption that is shown black: the largest of all films, so that they can be compared."""
-    return max(max((film.most for film in films), default=0.0), 1e-3)
+    return max([1e-3, *(float(film.absorption.max(initial=0.0)) for film in films)])

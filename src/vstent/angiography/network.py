@@ -59,12 +59,12 @@ class Network:
     """Root mean square of the change that balances the flow rates, relative to theirs."""
 
     def __post_init__(self) -> None:
-        freeze(self, "cells", np.int32, (-1, 3))
-        freeze(self, "width", np.int32, (len(self.cells),))
-        freeze(self, "points_mm", np.float64, (len(self.cells), 3))
-        freeze(self, "volume_mm3", np.float64, (len(self.cells),))
-        freeze(self, "left", np.int32, (-1,))
-        freeze(self, "right", np.int32, (len(self.left),))
+        n = len(self.cells)
+        freeze(self, "cells", np.int32, (n, 3))
+        freeze(self, "width", np.int32, (n,))
+        freeze(self, "points_mm", np.float64, (n, 3))
+        freeze(self, "volume_mm3", np.float64, (n,))
+        freeze(self, "left right", np.int32, (len(self.left),))
         freeze(self, "axis", np.int8, (len(self.left),))
         freeze(self, "time_s", np.float64, (-1,))
         freeze(self, "flux_mm3_s", np.float64, (len(self.time_s), len(self.left)))

@@ -34,8 +34,7 @@ class Washout:
     """Part of the mean age that is extrapolated from the last times."""
 
     def __post_init__(self) -> None:
-        freeze(self, "time_s", np.float64, (-1,))
-        freeze(self, "left_fraction", np.float64, (len(self.time_s),))
+        freeze(self, "time_s left_fraction", np.float64, (len(self.time_s),))
 
     @property
     def mean_age_s(self) -> float:

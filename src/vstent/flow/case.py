@@ -42,10 +42,9 @@ class Sheet:
     """(p,) distance between neighbouring wires; equal to the wire diameter in a sheet without gaps."""
 
     def __post_init__(self) -> None:
-        freeze(self, "points_mm", np.float64, (-1, 3))
-        freeze(self, "normals", np.float64, (len(self.points_mm), 3))
-        for column in fields(self)[2:]:
-            freeze(self, column.name, np.float64, (len(self.points_mm),))
+        n = len(self.points_mm)
+        freeze(self, "points_mm normals", np.float64, (n, 3))
+        freeze(self, " ".join(column.name for column in fields(self)[2:]), np.float64, (n,))
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,9 +185,7 @@ class Level(Cells):
     def __post_init__(self) -> None:
         super().__post_init__()
         freeze(self, "velocity_m_s", np.float64, (len(self.cells), 3))
-        freeze(self, "pressure_Pa", np.float64, (len(self.cells),))
-        if self.mean_speed_m_s is not None:
-            freeze(self, "mean_speed_m_s", np.float64, (len(self.cells),))
+        freeze(self, "pressure_Pa mean_speed_m_s", np.float64, (len(self.cells),))
 
     @staticmethod
     def of(cells: Cells, velocity_m_s: Floats, pressure_Pa: Floats, mean_speed_m_s: Floats | None = None) -> "Level":
@@ -221,8 +218,7 @@ class Phase:
     """Neck inflow at this moment, or None (see `FlowField.neck_inflow_mL_s`)."""
 
     def __post_init__(self) -> None:
-        freeze(self, "inlets_mL_s", np.float64, (-1,))
-        freeze(self, "outlets_mL_s", np.float64, (-1,))
+        freeze(self, "inlets_mL_s outlets_mL_s", np.float64, (-1,))
         freeze(self, "wall_shear_stress_Pa", np.float32, (-1, 3))
         for name, shape in (("velocity_m_s", (-1, 3)), ("pressure_Pa", (-1,))):
             values = tuple(read_only(one, np.float32, shape, name) for one in getattr(self, name))
@@ -287,14 +283,10 @@ class FlowField:
     def __post_init__(self) -> None:
         v = len(self.wall.vertices_mm)
         freeze(self, "wall_shear_stress_Pa", np.float64, (v, 3))
-        freeze(self, "wall_pressure_Pa", np.float64, (v,))
-        freeze(self, "inlets_mL_s", np.float64, (-1,))
-        freeze(self, "outlets_mL_s", np.float64, (-1,))
-        freeze(self, "inlet_pressure_Pa", np.float64, (len(self.inlets_mL_s),))
-        freeze(self, "outlet_pressure_Pa", np.float64, (len(self.outlets_mL_s),))
+        freeze(self, "wall_pressure_Pa mean_shear_Pa", np.float64, (v,))
+        freeze(self, "inlets_mL_s inlet_pressure_Pa", np.float64, (len(self.inlets_mL_s),))
+        freeze(self, "outlets_mL_s outlet_pressure_Pa", np.float64, (len(self.outlets_mL_s),))
         freeze(self, "residual", np.float64, (-1,))
-        if self.mean_shear_Pa is not None:
-            freeze(self, "mean_shear_Pa", np.float64, (v,))
 
     @property
     def inflow_mL_s(self) -> float:

@@ -66,12 +66,9 @@ class Domain(Cells):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        freeze(self, "link_cell", np.int32, (-1,))
-        freeze(self, "link_direction", np.int32, self.link_cell.shape)
-        freeze(self, "link_fraction", np.float64, self.link_cell.shape)
-        freeze(self, "link_patch", np.int32, self.link_cell.shape)
-        freeze(self, "septum_cell", np.int32, (-1,))
-        freeze(self, "septum_direction", np.int32, self.septum_cell.shape)
+        freeze(self, "link_cell link_direction link_patch", np.int32, (len(self.link_cell),))
+        freeze(self, "link_fraction", np.float64, (len(self.link_cell),))
+        freeze(self, "septum_cell septum_direction", np.int32, (len(self.septum_cell),))
 
     @cached_property
     def depth_mm(self) -> Floats:

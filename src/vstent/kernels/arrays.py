@@ -19,9 +19,14 @@ def read_only(values: Any, dtype: DTypeLike, shape: tuple[int, ...], name: str) 
     return array
 
 
-def freeze(noun: object, name: str, dtype: DTypeLike, shape: tuple[int, ...]) -> None:
-    """Replace the field `name` of a frozen dataclass by a read-only copy; call it in ``__post_init__``."""
-    object.__setattr__(noun, name, read_only(getattr(noun, name), dtype, shape, name))
+def freeze(noun: object, names: str, dtype: DTypeLike, shape: tuple[int, ...]) -> None:
+    """Replace fields of a frozen dataclass, unless None, by read-only copies; call it in ``__post_init__``.
+
+    The names are separated by spaces.
+    """
+    for name in names.split():
+        if getattr(noun, name) is not None:
+            object.__setattr__(noun, name, read_only(getattr(noun, name), dtype, shape, name))
 
 
 def unique_rows(rows: Ints) -> tuple[Ints, Ints]:

@@ -24,7 +24,7 @@ from vstent.flow.openfoam import folder as folders
 from vstent.flow.openfoam import program, results, scatter
 from vstent.flow.openfoam.bridge import Snapshot, bridge
 from vstent.flow.openfoam.dialects import Flavour
-from vstent.flow.openfoam.engine import OpenFoam, State, mean_magnitudes
+from vstent.flow.openfoam.engine import OpenFoam, State
 from vstent.flow.openfoam.setup import FoamSetup
 from vstent.flow.problem import flow_case, vessel_case
 from vstent.flow.settings import FlowSettings, Numerics, Waveform
@@ -282,28 +282,32 @@ def test_openfoams_flow_from_two_inlets_is_the_embedded_engines(tmp_path: Path) 
     assert apart < 0.08
 
 
-def test_what_goes_to_and_fro_from_check_to_check_is_told_by_its_size() -> None:
-    still, outflow = np.zeros(2), np.zeros(2)
-    one = Snapshot("50", np.array([[3.0, 4, 0], [0, 1, 0]]), still, np.array([[0.0, 0, 2]]), still, outflow, 1.0)
-    other = replace(one, velocity_m_s=-one.velocity_m_s, wall_shear_stress_Pa=-one.wall_shear_stress_Pa)
-    speed_m_s, shear_Pa = mean_magnitudes([one, other])
-    np.testing.assert_allclose(speed_m_s, [5, 1])
-    np.testing.assert_allclose(shear_Pa, [2])
-
-
-def test_of_a_flow_that_does_not_settle_the_neck_inflow_is_the_mean_of_its_checks(tmp_path: Path) -> None:
+def test_of_a_flow_that_does_not_settle_neck_inflow_and_magnitudes_are_the_mean_of_its_checks(tmp_path: Path) -> None:
     case = vessel_case(tube(), FlowSettings(inflow_mL_s=FLOW_ML_S))
     grid = domain.build(case.vessel, 0.5)
     n, v = len(grid.cells), len(case.vessel.lumen.vertices_mm)
-    one = Snapshot("50", np.zeros((n, 3)), np.zeros(n), np.zeros((v, 3)), np.zeros(v), np.zeros(2), 1.0)
+    velocity_m_s, stress_Pa = np.zeros((n, 3)), np.zeros((v, 3))
+    velocity_m_s[0], stress_Pa[1] = (3, 4, 0), (0, 0, 2)
+    one = Snapshot("50", velocity_m_s, np.zeros(n), stress_Pa, np.zeros(v), np.zeros(2), 1.0)
+    # What goes to and fro from check to check is told by its size.
+    other = replace(one, velocity_m_s=-velocity_m_s, wall_shear_stress_Pa=-stress_Pa, neck_inflow_mL_s=2.0)
     unused = cast("Any", SimpleNamespace(n_cells=n))
-    kept = deque([one, replace(one, neck_inflow_mL_s=2.0)])
     state = State(
-        case, FoamSetup(0.5), unused, "simpleFoam", tmp_path, grid, unused, np.arange(n, dtype=np.int32), kept
+        case,
+        FoamSetup(0.5),
+        unused,
+        "simpleFoam",
+        tmp_path,
+        grid,
+        unused,
+        np.arange(n, dtype=np.int32),
+        deque([one, other]),
     )
     field = OpenFoam(0.5, tmp_path).result(state, Outcome(False, (0.5,), 1.0, 1.0))
-    assert field.mean_shear_Pa is not None
     assert field.neck_inflow_mL_s == 1.5
+    assert field.speed_m_s.tolist() == [5.0, *np.zeros(n - 1)]
+    assert field.shear_Pa.tolist() == [0.0, 2.0, *np.zeros(v - 2)]
+    assert not field.velocity_m_s.any()
 
 
 @pytest.mark.skipif(shutil.which("pimpleFoam") is None, reason="OpenFOAM is not installed (apt-get install openfoam)")

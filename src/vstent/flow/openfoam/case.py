@@ -1,6 +1,8 @@
 """Build an OpenFOAM case folder in memory: the text of every file by its relative path."""
 
 from dataclasses import dataclass
+from importlib import resources
+from string import Template
 from typing import Final
 
 import numpy as np
@@ -15,38 +17,8 @@ from vstent.flow.openfoam.setup import FoamSetup
 from vstent.geometry.surface import Surface
 from vstent.units import M_PER_MM
 
-README: Final = """\
-OpenFOAM case written by vstent (research use only). Lengths are in m, in the vessel's LPS axes.
-
-  ./Allrun             mesh and compute on this machine; run it again to resume from the last time written
-  sbatch submit.slurm  the same on a cluster
-  ./Allclean           delete all results and restore the case as exported
-
-Patches: wall{sac}, {inlets}, outlet_1, ... (from the widest to the narrowest), each outlet at the end of a straight
-extension. p is pressure divided by density ({density:.6g} kg/m3). wallShearStress is the traction of the wall on the
-blood, divided by density: multiply it by minus the density to obtain the wall shear stress.
-Mean inflow: {inflow:.6g} mL/s.
-"""
-"""README file of a case."""
-SLURM: Final = """\
-#!/bin/sh
-#SBATCH --job-name=vstent
-#SBATCH --ntasks={processes}
-#SBATCH --time=04:00:00
-#SBATCH --mem-per-cpu=2G
-#SBATCH --output=slurm-%j.log
-# Load your site's OpenFOAM here, for example: module load openfoam
-# If the job runs out of time, submit it again: it resumes where it stopped.
-./Allrun
-"""
-"""Slurm script, which runs Allrun."""
-ALL_CLEAN: Final = """\
-#!/bin/sh
-cd "${0%/*}" || exit 1
-rm -rf constant/polyMesh constant/extendedFeatureEdgeMesh constant/triSurface/*.eMesh constant/geometry/*.eMesh
-rm -rf processor* postProcessing log.* [1-9]* 0.[0-9]*
-"""
-"""Script that restores the case as exported."""
+SCRIPTS: Final = ("Allrun", "Allclean", "submit.slurm")
+"""Scripts of a case; their texts and that of its README are in the folder ``exported``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +73,24 @@ def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
         surfaces[mesh.STRUTS] = {mesh.STRUTS: setup.struts.corners_mm}
         walls.append(mesh.STRUTS)
     application = dialect.application(is_steady=is_steady)["application"]
+    before, solve, after = "", application, ""
+    if setup.processes > 1:
+        before = "[ -d processor0 ] || decomposePar > log.decomposePar 2>&1\n"
+        solve = f"mpirun -np {setup.processes} {application} -parallel"
+        after = "reconstructPar -latestTime > log.reconstructPar 2>&1\n"
+    values = {
+        "before": before,
+        "solve": solve,
+        "after": after,
+        "application": application,
+        "features": dialect.features,
+        "processes": setup.processes,
+        "sac": ", sac" if "sac" in kinds else "",
+        "inlets": ", ".join(inlet.role for inlet in case.vessel.inlets),
+        "density": f"{case.blood.density_kg_m3:.6g}",
+        "inflow": f"{case.inflow_mL_s:.6g}",
+    }
+    texts = {name: (resources.files(__package__) / "exported" / name).read_text() for name in ("README", *SCRIPTS)}
     files = {
         "system/controlDict": control.control(case, setup, walls),
         "system/fvSchemes": control.schemes(is_steady=is_steady),
@@ -109,43 +99,10 @@ def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
         "system/blockMeshDict": mesh.block_mesh(vertices_mm, setup.cell_size_mm),
         f"system/{dialect.features}Dict": dialect.rims(f"{mesh.ENDS}.stl"),
         "system/snappyHexMeshDict": mesh.snappy(case, setup, kinds, sections),
-        "Allrun": _all_run(setup, application),
-        "Allclean": ALL_CLEAN,
-        "submit.slurm": SLURM.format(processes=setup.processes),
-        "README": README.format(
-            sac=", sac" if "sac" in kinds else "",
-            inlets=", ".join(inlet.role for inlet in case.vessel.inlets),
-            density=case.blood.density_kg_m3,
-            inflow=case.inflow_mL_s,
-        ),
+        **{name: Template(text).safe_substitute(values) for name, text in texts.items()},
         "vstent.foam": "",
         **boundary_files(case, setup, sections, walls),
     }
     files |= {f"constant/{name}": text for name, text in control.fluid(case.blood, setup).items()}
     files |= {f"{dialect.surfaces}/{name}.stl": stl_text(solids, M_PER_MM) for name, solids in surfaces.items()}
-    return FoamCase(files, ("Allrun", "Allclean", "submit.slurm"), application)
-
-
-def _all_run(setup: FoamSetup, application: str) -> str:
-    """Return Allrun, which meshes once and then computes; run again, it resumes from the last time written."""
-    features, solve = setup.dialect.features, application
-    before = after = ""
-    if setup.processes > 1:
-        solve = f"mpirun -np {setup.processes} {application} -parallel"
-        before = "[ -d processor0 ] || decomposePar > log.decomposePar 2>&1\n"
-        after = "reconstructPar -latestTime > log.reconstructPar 2>&1\n"
-    return f"""\
-#!/bin/sh
-set -e
-cd "${{0%/*}}"
-# Debian's package has no bashrc to source; its programs only need the folder of their settings.
-if [ -z "$WM_PROJECT_DIR" ] && [ -d /usr/share/openfoam/etc ]; then export WM_PROJECT_DIR=/usr/share/openfoam; fi
-if [ ! -f constant/polyMesh/owner ] || [ ! -f log.snappyHexMesh ]; then
-    {features} > log.{features} 2>&1
-    blockMesh > log.blockMesh 2>&1
-    snappyHexMesh -overwrite > log.snappyHexMesh 2>&1
-    checkMesh > log.checkMesh 2>&1
-    renumberMesh -overwrite > log.renumberMesh 2>&1
-fi
-{before}{solve} >> log.{application} 2>&1
-{after}"""
+    return FoamCase(files, SCRIPTS, application)

@@ -185,7 +185,11 @@ class OpenFoam(AbstractEngine[State]):
         pressure_Pa = mean("pressure_Pa")
         inlet_Pa, outlet_Pa = vessel.of_inlets_and_outlets(domains.section_pressure_Pa(vessel, domain, pressure_Pa))
         backwards_mL_s, outlets_mL_s = vessel.of_inlets_and_outlets(mean("outflow_mL_s"))
-        speed_m_s, shear_Pa = (None, None) if phase_s or len(snapshots) == 1 else mean_magnitudes(snapshots)
+        speed_m_s = shear_Pa = None
+        if phase_s is None and len(snapshots) > 1:  # checks of a steady solver that did not converge
+            speeds_m_s = [np.linalg.norm(one.velocity_m_s, axis=1) for one in snapshots]
+            shears_Pa = [np.linalg.norm(one.wall_shear_stress_Pa, axis=1) for one in snapshots]
+            speed_m_s, shear_Pa = np.mean(speeds_m_s, axis=0), np.mean(shears_Pa, axis=0)
         steps = len(state.history) * (1 if phase_s else CHECK_ITERATIONS)
         phases = []
         for k, one in enumerate(snapshots if phase_s else ()):
@@ -228,13 +232,6 @@ def _correct_inflow(state: State) -> bool:
         if abs(factor - 1) > 1e-5
     ]
     return any(scaled)
-
-
-def mean_magnitudes(snapshots: list[Snapshot]) -> tuple[Floats, Floats]:
-    """Return mean speed (n,) and mean wall shear stress (v,) of the checks of a steady solver that did not converge."""
-    speed_m_s = np.mean([np.linalg.norm(one.velocity_m_s, axis=1) for one in snapshots], axis=0)
-    shear_Pa = np.mean([np.linalg.norm(one.wall_shear_stress_Pa, axis=1) for one in snapshots], axis=0)
-    return np.asarray(speed_m_s), np.asarray(shear_Pa)
 
 
 def _advice(state: State, outcome: Outcome) -> str:
