@@ -17,10 +17,10 @@ from vstent.flow.lattice.gpu import require_gpu
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.pace import longest_step_s, pace, peak_speed_m_s
 from vstent.flow.lattice.reading import field_of, read, read_moving
-from vstent.flow.lattice.settling import CHECKS_APART, Mean, left_to_settle, mean_of, with_check
+from vstent.flow.lattice.settling import CHECKS_APART, SHARE_OF_FIELD, Mean, field_left, mean_of, with_check
 from vstent.flow.lattice.state import State
 from vstent.flow.lattice.trouble import trouble
-from vstent.flow.stopping import SURE, swings
+from vstent.flow.stopping import SURE, quantities_left, swings
 from vstent.units import M_PER_MM
 
 CHECK_DIAMETERS = 0.5
@@ -118,7 +118,7 @@ class LatticeBoltzmann(AbstractLattice):
     def step(self, state: State) -> State:
         """Advance the run towards its next check and, at a check, update the block means."""
         super().step(state)
-        if stepping.is_at_check(state):
+        if not state.since_check:
             state.blocks = with_check(state.blocks, state.snapshots[-1])
         return state
 
@@ -127,7 +127,7 @@ class LatticeBoltzmann(AbstractLattice):
 
         None between checks; nan when the run has diverged.
         """
-        if not stepping.is_at_check(state):
+        if state.since_check:
             return None
         if state.snapshots[-1].is_lost:
             return float("nan")
@@ -163,7 +163,7 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
 
         None between checks; inf within a cycle; nan when the run has diverged.
         """
-        if not stepping.is_at_check(state):
+        if state.since_check:
             return None
         return float("nan") if state.snapshots[-1].is_lost else cycle_change(np.array(state.history))
 
@@ -193,7 +193,8 @@ def _left(state: State) -> float:
     wanted = (links.wanted * links.openings[:, d3q19.AREA])[enters]
     # Not zero while sound waves leave through the openings.
     inflow_error = float(np.abs(state.snapshots[-1].outflow[enters] + wanted).sum() / wanted.sum())
-    return max(left_to_settle(np.array(state.history), fields), INFLOW_WEIGHT * inflow_error)
+    of_field = SHARE_OF_FIELD * field_left(fields)
+    return max(quantities_left(np.array(state.history)), of_field, INFLOW_WEIGHT * inflow_error)
 
 
 def _mean(state: State) -> Mean:

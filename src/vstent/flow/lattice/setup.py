@@ -187,21 +187,16 @@ class Refill:
     """(w,) mass added to every wall cell in every step."""
 
 
-def in_extensions(case: FlowCase, domain: Domain) -> Bools:
-    """Return for every cell (n,) whether it lies in the extension of an opening."""
-    result = np.zeros(len(domain.cells), dtype=bool)
-    for opening, section in zip(case.vessel.openings, domain.sections, strict=True):
-        offset = domain.centers_mm - opening.center_mm
-        ahead_mm = offset @ opening.normal
-        length_mm = float(((section - opening.center_mm) @ opening.normal).max())
-        beside_mm = np.linalg.norm(offset - ahead_mm[:, None] * opening.normal, axis=1)
-        result |= (ahead_mm > 0) & (ahead_mm < length_mm) & (beside_mm < opening.diameter_mm)
-    return result
-
-
 def thickest(case: FlowCase, domain: Domain) -> NDArray[np.float32]:
     """Return the largest grid Reynolds number (n,) of every cell, above which the viscosity is raised."""
-    limit = np.where(in_extensions(case, domain), CELL_REYNOLDS_AT_END, CELL_REYNOLDS)
+    beyond = np.zeros(len(domain.cells), dtype=bool)  # in the extension of an opening
+    for opening, section in zip(case.vessel.openings, domain.sections, strict=True):
+        offset_mm = domain.centers_mm - opening.center_mm
+        ahead_mm = offset_mm @ opening.normal
+        length_mm = float(((section - opening.center_mm) @ opening.normal).max())
+        beside_mm = np.linalg.norm(offset_mm - ahead_mm[:, None] * opening.normal, axis=1)
+        beyond |= (ahead_mm > 0) & (ahead_mm < length_mm) & (beside_mm < opening.diameter_mm)
+    limit = np.where(beyond, CELL_REYNOLDS_AT_END, CELL_REYNOLDS)
     cut = np.zeros(domain.cells.max(axis=0) + 2, dtype=bool)
     cut[tuple(domain.cells[domain.link_cell[domain.link_patch > len(case.vessel.openings)]].T)] = True
     for cells, most in ((CUT_CELLS, CELL_REYNOLDS_AT_END), (CELLS_IN_CUT, CELL_REYNOLDS_IN_CUT)):
@@ -212,13 +207,7 @@ def thickest(case: FlowCase, domain: Domain) -> NDArray[np.float32]:
 
 
 def address(domain: Domain, limit: NDArray[np.float32]) -> Addressing:
-    """Return the memory layout of the populations of a domain.
-
-    Parameters
-    ----------
-    limit : (n,) float32; largest grid Reynolds number of every cell (see `thickest`). A segment contains only cells
-        with equal values.
-    """
+    """Return the memory layout of the populations of a domain; each segment has one `limit` (see `thickest`)."""
     cells = domain.cells
     inside = np.zeros(cells.max(axis=0) + 3, dtype=bool)
     inside[tuple(cells.T)] = True
@@ -232,31 +221,25 @@ def address(domain: Domain, limit: NDArray[np.float32]) -> Addressing:
     is_new = (np.diff(cells, axis=0) != (0, 0, 1)).any(axis=1) | (np.diff(limit) != 0)
     first: Ints = np.flatnonzero(np.r_[True, is_new])
     length = np.diff(np.r_[first, len(cells)])
-    first, length = _cut(first, length)
+    pieces = -(-length // d3q19.SEGMENT)
+    owner = np.repeat(np.arange(len(first)), pieces)
+    offset = d3q19.SEGMENT * (np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces))
+    first, length = first[owner] + offset, np.minimum(length[owner] - offset, d3q19.SEGMENT)
     start = cells[first]
     behind = [number[tuple((start - c).T)] for c in directions.VELOCITIES]
-    septa = _septa(domain, number, stride)
-    links = _link_addresses(domain, number, inside, stride, septa)
-    to_int = np.int32
+    q, cell = domain.septum_direction, cells[domain.septum_cell]
+    here, ahead = (number[tuple(x.T)] for x in (cell, cell + directions.VELOCITIES[q]))
+    septa = np.stack([d3q19.OPPOSITE[q] * stride + here, q * stride + ahead]).astype(np.int32)
     return Addressing(
         stride,
         place,
-        length.astype(to_int),
-        first.astype(to_int),
+        length.astype(np.int32),
+        first.astype(np.int32),
         d3q19.addresses(place[first], behind, stride),
-        *links,
+        *_link_addresses(domain, number, inside, stride, septa),
         septa,
         domain.septum_cell,
     )
-
-
-def _cut(first: Ints, length: Ints) -> tuple[Ints, Ints]:
-    """Return first cell and length of the segments after splitting those longer than `d3q19.SEGMENT`."""
-    pieces = -(-length // d3q19.SEGMENT)
-    owner = np.repeat(np.arange(len(first)), pieces)
-    rank = np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    start = rank * d3q19.SEGMENT
-    return first[owner] + start, np.minimum(length[owner] - start, d3q19.SEGMENT)
 
 
 def _link_addresses(
@@ -280,14 +263,6 @@ def _link_addresses(
         q * stride + behind,
     ]
     return np.stack(rows, axis=1).astype(np.int32), has_one, has_two
-
-
-def _septa(domain: Domain, number: Ints, stride: int) -> Ints:
-    """Return the addresses (2, t) of the populations that cells on both sides of a septum would exchange."""
-    q = domain.septum_direction
-    cell = domain.cells[domain.septum_cell]
-    here, ahead = (number[tuple(x.T)] for x in (cell, cell + directions.VELOCITIES[q]))
-    return np.stack([d3q19.OPPOSITE[q] * stride + here, q * stride + ahead]).astype(np.int32)
 
 
 def build_links(case: FlowCase, grid: Grid, scales: Scales, close_up: CloseUp | None) -> Links:
@@ -324,12 +299,6 @@ def build_links(case: FlowCase, grid: Grid, scales: Scales, close_up: CloseUp | 
         course,
         shape,
     )
-
-
-def build_refill(grid: Grid) -> Refill:
-    """Return the redistribution of the mass lost at the walls of a grid, with nothing lost yet."""
-    place, groups = grid.groups
-    return Refill(place, groups, np.zeros(len(groups[1]), np.float32), np.zeros(len(place), np.float32))
 
 
 def _grouped(group: Ints) -> tuple[Ints, Ints]:

@@ -16,11 +16,7 @@ from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.scales import Scales
 from vstent.flow.lattice.screen import ScreenEntries
-from vstent.flow.lattice.setup import (
-    Addressing,
-    Links,
-    Refill,
-)
+from vstent.flow.lattice.setup import Addressing, Links, Refill
 from vstent.kernels.arrays import Floats, Ints
 
 DEFER_PAIRS = 8
@@ -118,18 +114,15 @@ class OnDevice(Protocol):
     """A run whose arrays are on a GPU."""
 
     def advance(self, wanted: Floats, moments: Floats, first_pair: int) -> None:
-        """Make one pair of time steps per row of `wanted`.
+        """Make one pair of time steps per row of `wanted` (pairs, k) and `moments` (pairs, 3) from `stepping.imposed`.
 
-        Parameters
-        ----------
-        wanted, moments : (pairs, k), (pairs, 3); boundary values from `stepping.imposed`.
-        first_pair : number of the first pair, counted from the last check.
+        The number of the first pair counts from the last check.
         """
 
     def begin(self, wanted: Floats, moments: Floats, first_pair: int) -> bool:
-        """Queue the first pairs of the next `advance`, without waiting for them; return whether there are any.
+        """Queue the first pairs of the next `advance` without waiting for them; return whether there are any.
 
-        Until then only `fetch` may be called, which counts them as made. The arguments are those of `advance`.
+        Until then only `fetch` may be called, which counts them as made.
         """
 
     def read(self) -> tuple[NDArray[np.float32], NDArray[np.float32], Floats]:
