@@ -173,32 +173,26 @@ def build(case: FlowCase, cell_size_mm: float, chosen: CloseUp) -> Domain:
     Links that leave the region through a cut have the patch number of their part: part p has the last opening's patch
     number plus p + 1.
     """
-    grid = domains.build(case.vessel, cell_size_mm, _window(chosen, cell_size_mm))
+    # Grid points in coarse cells within the region, or next to one at the wall.
+    outer = chosen.outer.finest
+    inner = outer.cells[chosen.part < 0]
+    low = inner.min(axis=0) - 2
+    within, outside = np.zeros((2, *(inner.max(axis=0) - low + 3)), dtype=bool)
+    within[tuple((inner - low).T)] = True
+    others = outer.cells[chosen.part >= 0] - low
+    outside[tuple(others[((others >= 0) & (others < outside.shape)).all(axis=1)].T)] = True
+    within |= ndimage.binary_dilation(within, np.ones((3, 3, 3), dtype=bool)) & ~outside
+    fine = within.repeat(WIDTH, axis=0).repeat(WIDTH, axis=1).repeat(WIDTH, axis=2)
+    corner_mm = outer.origin_mm + low * outer.cell_size_mm - 0.5 * (outer.cell_size_mm - cell_size_mm)
+    grid = domains.build(case.vessel, cell_size_mm, Window(corner_mm, fine))
     leads_beyond = grid.link_patch == BEYOND
     ahead_mm = cell_size_mm * VELOCITIES[grid.link_direction[leads_beyond]]
     beyond = np.flatnonzero(chosen.part >= 0)
-    nearest = cKDTree(chosen.outer.finest.centers_mm[beyond])
+    nearest = cKDTree(outer.centers_mm[beyond])
     nearest_beyond = beyond[nearest.query(grid.centers_mm[grid.link_cell[leads_beyond]] + ahead_mm)[1]]
     patch = grid.link_patch.copy()
     patch[leads_beyond] = len(case.vessel.openings) + 1 + chosen.part[nearest_beyond]
     return replace(grid, link_patch=patch)
-
-
-def _window(chosen: CloseUp, cell_size_mm: float) -> Window:
-    """Return the fine grid points in coarse cells within the region, or next to one at the wall."""
-    outer = chosen.outer.finest
-    inner = outer.cells[chosen.part < 0]
-    low = inner.min(axis=0) - 2
-    shape = inner.max(axis=0) - low + 3
-    within = np.zeros(shape, dtype=bool)
-    within[tuple((inner - low).T)] = True
-    beyond = np.zeros(shape, dtype=bool)
-    others = outer.cells[chosen.part >= 0] - low
-    beyond[tuple(others[((others >= 0) & (others < shape)).all(axis=1)].T)] = True
-    within |= ndimage.binary_dilation(within, np.ones((3, 3, 3), dtype=bool)) & ~beyond
-    fine = within.repeat(WIDTH, axis=0).repeat(WIDTH, axis=1).repeat(WIDTH, axis=2)
-    corner_mm = outer.origin_mm + low * outer.cell_size_mm - 0.5 * (outer.cell_size_mm - cell_size_mm)
-    return Window(corner_mm, fine)
 
 
 def assembled(chosen: CloseUp, inner: FlowField) -> FlowField:
