@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vstent.flow.lattice.kernels import d3q19, lanes
-from vstent.flow.lattice.walls import linear_weights, quadratic_weights
+from vstent.flow.lattice.setup import linear_weights, quadratic_weights
 from vstent.kernels import directions
 from vstent.kernels.arrays import Bools, Floats, Ints
 

@@ -13,10 +13,9 @@ from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.kernels import d3q19, lanes
 from vstent.flow.lattice.kernels.collision import collided, relaxed, squared_reach
 from vstent.flow.lattice.scales import ODD_RATE as VESSEL_ODD_RATE
-from vstent.flow.lattice.setup import Grid, address, build_links, thickest
+from vstent.flow.lattice.setup import Grid, address, build_links, parabolic_weights, thickest
 from vstent.flow.lattice.state import speeds
 from vstent.flow.lattice.stepping import advance
-from vstent.flow.lattice.walls import parabolic_weights
 from vstent.flow.problem import vessel_case
 from vstent.flow.settings import FlowSettings
 from vstent.geometry.vessel import Vessel

@@ -58,14 +58,7 @@ def _snapshots(name: str, saved: Saved, scales: Scales) -> Iterator[Snapshot]:
 
 
 def unpack(case: FlowCase, cell_size_mm: float, saved: Saved, close_up: CloseUp | None) -> State:
-    """Rebuild a run from its case and the saved arrays.
-
-    Parameters
-    ----------
-    cell_size_mm : grid spacing.
-    saved : dict of arrays; result of `pack`.
-    close_up : refined region and the flow around it.
-    """
+    """Rebuild a run from its case and the arrays of `pack`."""
     check_s, kept = float(saved["check_s"]), int(saved["kept"])
     state = build(case, cell_size_mm, check_s, saved["pace"], close_up=close_up, start=None, kept=kept)
     state.history = list(saved["history"])

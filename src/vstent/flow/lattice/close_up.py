@@ -76,12 +76,6 @@ class CloseUp:
         return replace(self, outer=self.outer.at_phase(phase))
 
     @cached_property
-    def _tree_beyond(self) -> tuple[cKDTree, Ints]:
-        """Return a search tree over the coarse cells outside the region, and the part (n,) of each."""
-        beyond = np.flatnonzero(self.part >= 0)
-        return cKDTree(self.outer.finest.centers_mm[beyond]), self.part[beyond]
-
-    @cached_property
     def _sharpened_m_s(self) -> Floats:
         """Return the velocity (n, 3) of the coarse cells, corrected so that linear interpolation has no mean error.
 
@@ -96,20 +90,11 @@ class CloseUp:
             curve[inner] += speed[ahead[inner]] + speed[behind[inner]] - 2 * speed[inner]
         return np.asarray(speed - curve / 12)
 
-    def part_at(self, points_mm: Floats) -> Ints:
-        """Return the part (m,) of the vessel in which points (m, 3) outside the region lie."""
-        tree, part = self._tree_beyond
-        return np.asarray(part[tree.query(points_mm)[1]])
-
     def velocity_m_s(self, points_mm: Floats, surface: Surface) -> Floats:
         """Return the velocity (m, 3) of the surrounding flow at points (m, 3).
 
-        Next to the wall the ratio of velocity to wall distance is interpolated instead of the velocity.
-
-        Parameters
-        ----------
-        points_mm : (m, 3); points.
-        surface : wall of the vessel, with the extensions of its openings.
+        Next to the wall, `surface` with the extensions of the openings, the ratio of velocity to wall distance is
+        interpolated instead of the velocity.
         """
         outer = self.outer.finest
         cells, weights = lattice_sampling.stencils(outer.index, outer.places(points_mm))
@@ -126,13 +111,7 @@ class CloseUp:
 
 
 def require_sac(case: FlowCase) -> Surface:
-    """Return the sac of a case, around which the grid is refined.
-
-    Raises
-    ------
-    FlowError
-        When the vessel has no sac.
-    """
+    """Return the sac of a case, around which the grid is refined; raise a `FlowError` where there is none."""
     if case.sac is None:
         raise FlowError(
             "the grid cannot be refined in the sac, because this vessel has none: switch that off (--refine-sac)"
@@ -141,17 +120,7 @@ def require_sac(case: FlowCase) -> Surface:
 
 
 def close_up(case: FlowCase, outer: FlowField) -> CloseUp:
-    """Choose the refined region of a case and determine the flow rate through each of its cuts.
-
-    Parameters
-    ----------
-    outer : flow in the whole vessel on the coarser grid.
-
-    Raises
-    ------
-    FlowError
-        When the vessel has no sac.
-    """
+    """Choose the refined region of a case inside a flow in the whole vessel; without a sac raise a `FlowError`."""
     surface, _, sections = domains.extend(case.vessel)
     grid = outer.finest
     graph = _neighbours(grid, surface)
@@ -170,13 +139,7 @@ def close_up(case: FlowCase, outer: FlowField) -> CloseUp:
 
 
 def volume_mm3(case: FlowCase) -> float:
-    """Estimate the volume of a case's refined region, the sac and a piece of the artery; it is about 15 % too high.
-
-    Raises
-    ------
-    FlowError
-        When the vessel has no sac.
-    """
+    """Estimate the volume of a case's refined region, the sac and a piece of the artery; it is about 15 % too high."""
     sac, diameter_mm = require_sac(case), domains.mean_diameter_mm(case.vessel)
     neck_mm2 = 0.0 if case.ostium is None else case.ostium.area_mm2
     stretch_mm = (UPSTREAM_DIAMETERS + DOWNSTREAM_DIAMETERS) * diameter_mm + sqrt(4 / pi * neck_mm2)
@@ -209,35 +172,27 @@ def build(case: FlowCase, cell_size_mm: float, chosen: CloseUp) -> Domain:
 
     Links that leave the region through a cut have the patch number of their part: part p has the last opening's patch
     number plus p + 1.
-
-    Parameters
-    ----------
-    cell_size_mm : fine grid spacing.
     """
-    grid = domains.build(case.vessel, cell_size_mm, _window(chosen, cell_size_mm))
-    leads_beyond = grid.link_patch == BEYOND
-    ahead_mm = cell_size_mm * VELOCITIES[grid.link_direction[leads_beyond]]
-    patch = grid.link_patch.copy()
-    part = chosen.part_at(grid.centers_mm[grid.link_cell[leads_beyond]] + ahead_mm)
-    patch[leads_beyond] = len(case.vessel.openings) + 1 + part
-    return replace(grid, link_patch=patch)
-
-
-def _window(chosen: CloseUp, cell_size_mm: float) -> Window:
-    """Return the fine grid points in coarse cells within the region, or next to one at the wall."""
+    # Grid points in coarse cells within the region, or next to one at the wall.
     outer = chosen.outer.finest
     inner = outer.cells[chosen.part < 0]
     low = inner.min(axis=0) - 2
-    shape = inner.max(axis=0) - low + 3
-    within = np.zeros(shape, dtype=bool)
+    within, outside = np.zeros((2, *(inner.max(axis=0) - low + 3)), dtype=bool)
     within[tuple((inner - low).T)] = True
-    beyond = np.zeros(shape, dtype=bool)
     others = outer.cells[chosen.part >= 0] - low
-    beyond[tuple(others[((others >= 0) & (others < shape)).all(axis=1)].T)] = True
-    within |= ndimage.binary_dilation(within, np.ones((3, 3, 3), dtype=bool)) & ~beyond
+    outside[tuple(others[((others >= 0) & (others < outside.shape)).all(axis=1)].T)] = True
+    within |= ndimage.binary_dilation(within, np.ones((3, 3, 3), dtype=bool)) & ~outside
     fine = within.repeat(WIDTH, axis=0).repeat(WIDTH, axis=1).repeat(WIDTH, axis=2)
     corner_mm = outer.origin_mm + low * outer.cell_size_mm - 0.5 * (outer.cell_size_mm - cell_size_mm)
-    return Window(corner_mm, fine)
+    grid = domains.build(case.vessel, cell_size_mm, Window(corner_mm, fine))
+    leads_beyond = grid.link_patch == BEYOND
+    ahead_mm = cell_size_mm * VELOCITIES[grid.link_direction[leads_beyond]]
+    beyond = np.flatnonzero(chosen.part >= 0)
+    nearest = cKDTree(outer.centers_mm[beyond])
+    nearest_beyond = beyond[nearest.query(grid.centers_mm[grid.link_cell[leads_beyond]] + ahead_mm)[1]]
+    patch = grid.link_patch.copy()
+    patch[leads_beyond] = len(case.vessel.openings) + 1 + chosen.part[nearest_beyond]
+    return replace(grid, link_patch=patch)
 
 
 def assembled(chosen: CloseUp, inner: FlowField) -> FlowField:

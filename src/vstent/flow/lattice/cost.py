@@ -79,7 +79,8 @@ def estimate(case: FlowCase) -> Cost:
     steps = _steps(case, cell_size_mm, close_up.SHARE_WITHIN if case.numerics.close_up else 1)
     updates = cells * steps
     if case.numerics.close_up:
-        updates += _wide_cells(case, cell_size_mm) * _steps(case, cell_size_mm, close_up.SHARE_AROUND)
+        wide_cells = abs(case.vessel.closed.volume_mm3) / (close_up.WIDTH * cell_size_mm) ** 3
+        updates += wide_cells * _steps(case, cell_size_mm, close_up.SHARE_AROUND)
     seconds = updates / block_rate(on_gpu=case.numerics.device_gpu) * WHOLE_OVER_BLOCK
     return Cost(cell_size_mm, round(cells), round(memory_bytes), steps, seconds)
 
@@ -148,11 +149,6 @@ def _size(case: FlowCase, cell_size_mm: float) -> tuple[float, float]:
     return cells, of_all + cells * BYTES_PER_CELL + (whole - cells) * BYTES_PER_CELL_OF_RESULT
 
 
-def _wide_cells(case: FlowCase, cell_size_mm: float) -> float:
-    """Return the number of cells of the coarser flow around a refined region."""
-    return abs(case.vessel.closed.volume_mm3) / (close_up.WIDTH * cell_size_mm) ** 3
-
-
 def _steps(case: FlowCase, cell_size_mm: float, share: float) -> int:
     """Return the maximum number of time steps; a steady flow makes the given share of those allowed."""
     if case.waveform is None:
@@ -160,14 +156,9 @@ def _steps(case: FlowCase, cell_size_mm: float, share: float) -> int:
     return int(pace(case, cell_size_mm, None).sum()) * case.numerics.max_cycles
 
 
+@cache
 def block_rate(*, on_gpu: bool = False) -> float:
     """Return the cell updates per second in a block of blood without walls, measured once on the CPU or the GPU."""
-    return _measured_rate(on_gpu)
-
-
-@cache
-def _measured_rate(on_gpu: bool) -> float:
-    """Return the measured cell updates per second."""
     keep_flow()
     length = np.full(BLOCK_ROWS, 64, np.int32)
     stride = int(length.sum())

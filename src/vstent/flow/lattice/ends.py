@@ -5,7 +5,6 @@ A *cut* is a cross-section of the vessel where the refined region ends and takes
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import assert_never
 
 import numpy as np
@@ -24,8 +23,6 @@ from vstent.kernels.arrays import Floats, Ints
 SOUND_MEMORY = 0.002
 """Rate per pair of time steps at which an inlet updates its mean pressure in steady flow. In pulsatile flow the rate is
 1: the mean follows every pressure change, so that the imposed waveform is kept exactly."""
-
-
 STILL = 0.05
 """Fraction of the mean inflow below which a cut imposes the velocity profile of the mean flow. The instantaneous
 profile is ill-defined when the flow is that small."""
@@ -45,10 +42,7 @@ class Ends:
     """Refined region and the flow around it; None: the grid covers the whole vessel."""
 
     def imposed(self, patches: Ints, links: Sequence[Ints]) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return the boundary conditions at the ends of the grid.
-
-        Shapes: `patches` (k,).
-        """
+        """Return rows (k, `d3q19.OPENING`) of the ends, and `Links.wanted`, `course` and `shape`."""
         usual, shape = self._at(self.close_up, patches, links)
         wanted = usual[:, d3q19.WANTED].copy()
         phases = () if self.close_up is None else self.close_up.outer.phases
@@ -91,8 +85,12 @@ class Ends:
 
     def _row(self, kind: float, speed: float, normal: Floats, area: float) -> Floats:
         """Return the row (`d3q19.OPENING`,) of an end: its condition, mean speed, outward normal and area in cells."""
+        if kind == d3q19.INFLOW:
+            rate = SOUND_MEMORY if self.case.waveform is None else 1.0
+        else:  # critical damping for a column of blood about as long as the grid
+            rate = 0.25 / float(np.ptp(self.domain.cells, axis=0).max())
         row = np.zeros(d3q19.OPENING)
-        row[[d3q19.KIND, d3q19.WANTED, d3q19.RATE, d3q19.AREA]] = kind, speed, self._rate(kind), area
+        row[[d3q19.KIND, d3q19.WANTED, d3q19.RATE, d3q19.AREA]] = kind, speed, rate, area
         row[d3q19.NORMAL : d3q19.NORMAL + 3] = normal
         return row
 
@@ -102,18 +100,6 @@ class Ends:
         places_mm = np.concatenate([self._along(links, part)[2] for part in (0.0, 0.5, 1.0)])
         speed = developed_profile(self.domain.sections[k], normal, places_mm)
         return _sent(self.domain.link_direction[links], normal, area, *(-speed.reshape(3, -1, 1) * normal))
-
-    def _rate(self, kind: float) -> float:
-        """Return the rate per step pair at which an end of this kind updates its remembered density."""
-        if kind == d3q19.INFLOW:
-            return SOUND_MEMORY if self.case.waveform is None else 1.0
-        # Critical damping for a column of blood about as long as the grid.
-        return 0.25 / self._length
-
-    @cached_property
-    def _length(self) -> float:
-        """Return the length of the grid in cells."""
-        return float(np.ptp(self.domain.cells, axis=0).max())
 
     def _entry(self, now: CloseUp, part: int, links: Ints) -> tuple[Floats, Floats]:
         """Return the row and profile coefficients of a cut with inflow.
@@ -136,13 +122,15 @@ class Ends:
         the remaining flow.
         """
         normal, area = self._section(links)
-        _, _, at_mm = self._along(links, 0.5)
-        density = sampling.values_at(now.outer, at_mm)[1] / self.scales.pressure_Pa
+        density = sampling.values_at(now.outer, self._along(links, 0.5)[2])[1] / self.scales.pressure_Pa
         inward = np.maximum(0.0, -self._velocity(now, links, 0.5) @ normal)
         density += 1.5 * inward**2  # `d3q19.outlet_source` subtracts this term again
-        kind = d3q19.PRESSURE if self._takes_the_rest(part) else d3q19.OUTFLOW
-        speed = -now.inflow_mL_s[part] / self.scales.flow_mL_s / area
-        row = self._row(kind, speed if kind == d3q19.OUTFLOW else 0.0, normal, area)
+        outside, first = self._outside, len(self.case.vessel.inlets) + 1
+        within = [k for k in range(len(self.case.vessel.outlets)) if (self.domain.link_patch == first + k).any()]
+        most_mL_s = float(np.concatenate([-outside.inflow_mL_s, outside.outer.outlets_mL_s[within]]).max())
+        takes_the_rest = -outside.inflow_mL_s[part] >= most_mL_s * (1 - 1e-9)
+        speed = 0.0 if takes_the_rest else -now.inflow_mL_s[part] / self.scales.flow_mL_s / area
+        row = self._row(d3q19.PRESSURE if takes_the_rest else d3q19.OUTFLOW, speed, normal, area)
         return row, np.stack([density, np.zeros(len(links))], axis=1)
 
     @property
@@ -150,14 +138,6 @@ class Ends:
         """Return the refined region and its surrounding flow, where there is one."""
         assert self.close_up is not None
         return self.close_up
-
-    def _takes_the_rest(self, part: int) -> bool:
-        """Return whether no other cut or outlet of this grid has a larger outflow."""
-        outside = self._outside
-        first = len(self.case.vessel.inlets) + 1
-        within = [k for k in range(len(self.case.vessel.outlets)) if (self.domain.link_patch == first + k).any()]
-        most_mL_s = float(np.concatenate([-outside.inflow_mL_s, outside.outer.outlets_mL_s[within]]).max())
-        return bool(-outside.inflow_mL_s[part] >= most_mL_s * (1 - 1e-9))
 
     def _along(self, links: Ints, part: float = 0.0) -> tuple[Ints, Ints, Floats]:
         """Return direction (l,) and velocity (l, 3) of links, and the point (l, 3), mm, at fraction `part` of each."""
@@ -182,29 +162,20 @@ class Ends:
 def _sent(direction: Ints, normal: Floats, area: float, inner: Floats, at: Floats, outer: Floats) -> Floats:
     """Return the source coefficients (l, 2) of an inflow: linear and quadratic in its mean speed.
 
+    The velocities (l, 3) are those at the near end, the middle and the far end of every link.
+
     Links at the rim of the opening end at the wall instead of the opening, and their share of the flow would be
     missing. It is added to the links near the rim. Scaling the whole profile instead would make the velocity on the
     axis too high, and this error persists for tens of diameters downstream.
 
-    Shapes: `direction` (l,), `normal` (3,), `inner, at, outer` (l, 3).
+    A velocity profile gains momentum from the relaxation rate of the odd populations, which would push blood towards
+    the axis: the inflow sends it back through the links with opposite sign.
     """
     c, weight = directions.VELOCITIES[direction], d3q19.WEIGHTS[direction]
     sent = -6 * weight * (c * at).sum(axis=1)
-    pushed = _pushed(direction, inner, outer)
+    of_inner, of_outer = (4.5 * (c * u).sum(axis=1) ** 2 - 1.5 * (u**2).sum(axis=1) for u in (inner, outer))
+    pushed = (2 / ODD_RATE - 1) * weight * (of_outer - of_inner)
     speed = -(at @ normal)
     rim = np.where(speed > 0, weight * np.maximum(c @ normal, 0.0) * (1 - speed / speed.max()), 0.0)
     rim /= rim.sum()
     return np.stack([sent + (area - sent.sum()) * rim, pushed - pushed.sum() * rim], axis=1)
-
-
-def _pushed(direction: Ints, inner: Floats, outer: Floats) -> Floats:
-    """Return the momentum (l,) that a velocity profile (l, 3) gains from the relaxation rate of the odd populations.
-
-    The inflow sends it back through the links with opposite sign. Otherwise it would push blood towards the axis.
-    """
-    c, weight = directions.VELOCITIES[direction], d3q19.WEIGHTS[direction]
-
-    def squared(u: Floats) -> Floats:
-        return np.asarray(4.5 * (c * u).sum(axis=1) ** 2 - 1.5 * (u**2).sum(axis=1))
-
-    return (2 / ODD_RATE - 1) * weight * (squared(outer) - squared(inner))

@@ -16,11 +16,12 @@ from vstent.flow.lattice.gpu import require_gpu
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.pace import longest_step_s, pace, peak_speed_m_s
 from vstent.flow.lattice.reading import field_of, read, read_moving
-from vstent.flow.lattice.settling import CHECKS_APART, Mean, left_to_settle, mean_of, with_check
-from vstent.flow.lattice.state import State
-from vstent.flow.lattice.trouble import trouble
-from vstent.flow.stopping import SURE, cycle_change, cycles_advice, swings
-from vstent.units import M_PER_MM
+from vstent.flow.lattice.settling import CHECKS_APART, SHARE_OF_FIELD, Mean, field_left, mean_of, with_check
+from vstent.flow.lattice.setup import CELL_REYNOLDS, CELL_REYNOLDS_AT_END
+from vstent.flow.lattice.state import Snapshot, State
+from vstent.flow.stopping import SURE, cycle_change, cycles_advice, quantities_left, swings
+from vstent.kernels.arrays import Floats
+from vstent.units import M_PER_MM, place
 
 CHECK_DIAMETERS = 0.5
 """Flow time between checks, in units of inlet diameter divided by mean inlet speed."""
@@ -32,6 +33,8 @@ INFLOW_WEIGHT: Final = 3
 measured, whereas the others are estimated."""
 SLOWER: Final = 0.5
 """Ratio by which the time step is reduced after a run has diverged."""
+FAST: Final = 0.4
+"""Speed in cells per time step above which the time step is reported as too long: it is close to the speed of sound."""
 
 
 class AbstractLattice(AbstractEngine[State]):
@@ -117,7 +120,7 @@ class LatticeBoltzmann(AbstractLattice):
     def step(self, state: State) -> State:
         """Advance the run towards its next check and, at a check, update the block means."""
         super().step(state)
-        if stepping.is_at_check(state):
+        if not state.since_check:
             state.blocks = with_check(state.blocks, state.snapshots[-1])
         return state
 
@@ -126,7 +129,7 @@ class LatticeBoltzmann(AbstractLattice):
 
         None between checks; nan when the run has diverged.
         """
-        if not stepping.is_at_check(state):
+        if state.since_check:
             return None
         if state.snapshots[-1].is_lost:
             return float("nan")
@@ -162,7 +165,7 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
 
         None between checks; inf within a cycle; nan when the run has diverged.
         """
-        if not stepping.is_at_check(state):
+        if state.since_check:
             return None
         return float("nan") if state.snapshots[-1].is_lost else cycle_change(np.array(state.history))
 
@@ -192,7 +195,8 @@ def _left(state: State) -> float:
     wanted = (links.wanted * links.openings[:, d3q19.AREA])[enters]
     # Not zero while sound waves leave through the openings.
     inflow_error = float(np.abs(state.snapshots[-1].outflow[enters] + wanted).sum() / wanted.sum())
-    return max(left_to_settle(np.array(state.history), fields), INFLOW_WEIGHT * inflow_error)
+    of_field = SHARE_OF_FIELD * field_left(fields)
+    return max(quantities_left(np.array(state.history)), of_field, INFLOW_WEIGHT * inflow_error)
 
 
 def _mean(state: State) -> Mean:
@@ -223,3 +227,45 @@ def _of_mean(state: State, mean: Mean, *, is_converged: bool) -> tuple[float, st
         else (f"; they differ by up to {100 * moved:.1f} % from the averages over an equal time before")
     )
     return float(np.nanmax([swing, moved])), f"{unsettled}{drift}."
+
+
+def trouble(state: State) -> str:
+    """Return one sentence: when the run diverged, where the flow was fastest, the likely cause and what to do."""
+    good = [one for one in state.snapshots if not one.is_lost]
+    when_ms = 1e3 * state.time_s
+    if not good:
+        return (
+            f"the flow diverged within the first {when_ms:.3g} ms, because the time step is too long for its "
+            "speed: use half the lattice speed or half the grid spacing"
+        )
+    last = good[-1]
+    speed = np.linalg.norm(last.velocity, axis=1)
+    fastest = int(speed.argmax())
+    behind = next(k for k, one in enumerate(reversed(state.snapshots)) if one is last)
+    good_ms = when_ms - 1e3 * behind * state.check_s
+    return (
+        f"the flow diverged between {good_ms:.3g} and {when_ms:.3g} ms; the fastest blood before was "
+        f"{speed[fastest] * last.scales.speed_m_s:.2g} m/s at {place(state.domain.centers_mm[fastest])}: "
+        + _cause(state, last, speed, fastest)
+    )
+
+
+def _cause(state: State, last: Snapshot, speed: Floats, fastest: int) -> str:
+    """Return the likely cause and what to do about it."""
+    if speed[fastest] > FAST:
+        return (
+            f"the time step is too long ({speed[fastest]:.2g} cells per step): use half the lattice speed "
+            f"({state.case.numerics.lattice_speed:.3g})"
+        )
+    for k, opening in enumerate(state.case.vessel.openings):
+        velocity = last.velocity[state.domain.link_cell[state.domain.link_patch == k + 1]]
+        if not opening.is_inlet and -(velocity @ opening.normal).min(initial=0.0) > FAST * speed[fastest]:
+            role = opening.role
+            return f"blood flows back through {role}: cut the vessel further away, or split the outflow by Murray's law"
+    otherwise = "" if state.close_up is None else ", or switch off the refinement in the sac (--refine-sac)"
+    cell_reynolds = speed[fastest] / last.scales.viscosity
+    return (
+        f"the grid is too coarse (grid Reynolds number {cell_reynolds:.0f}; the viscosity is raised above "
+        f"{CELL_REYNOLDS:.0f}, and above {CELL_REYNOLDS_AT_END:.0f} beyond the openings): use a grid spacing "
+        f"of {0.7 * state.domain.cell_size_mm:.2g} mm{otherwise}"
+    )

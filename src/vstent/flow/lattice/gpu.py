@@ -7,25 +7,15 @@ from typing import Final
 
 from vstent.errors import FlowError
 
-PACKAGE: Final = "numba_cuda"
-"""Module that compiles kernels for a GPU; installed by the extra ``gpu``."""
 ELSE: Final = "or compute on the processor (without --gpu)"
 """End of the error messages: the alternative that always works."""
-DRIVER: Final = "CUDA"
-"""Word in the errors of CUDA's driver, which errors of the compiler lack."""
 
 
 def require_gpu() -> None:
-    """Check that there is a usable GPU.
-
-    Raises
-    ------
-    FlowError
-        When there is none; the message says what is missing and how to install it.
-    """
+    """Raise a `FlowError` that says what is missing and how to install it, where there is no usable GPU."""
     import numba
 
-    if find_spec(PACKAGE) is None and not numba.config.ENABLE_CUDASIM:
+    if find_spec("numba_cuda") is None and not numba.config.ENABLE_CUDASIM:
         raise FlowError(
             "the flow cannot be computed on a GPU, because numba-cuda is not installed: run pip install "
             f"'vstent[gpu]', {ELSE}"
@@ -51,18 +41,12 @@ def require_gpu() -> None:
 
 @contextmanager
 def told() -> Iterator[None]:
-    """Convert errors of the GPU, its driver or its compiler to a `FlowError`.
-
-    Raises
-    ------
-    FlowError
-        With the first line of the original error.
-    """
+    """Convert errors of the GPU, its driver or its compiler to a `FlowError` with their first line."""
     try:
         yield
     except Exception as error:  # driver, compiler and numba each have their own exception classes
         words = next(iter(str(error).splitlines()), type(error).__name__)
-        if DRIVER not in f"{type(error).__name__} {error}".upper():
+        if "CUDA" not in f"{type(error).__name__} {error}".upper():  # errors of the driver name it
             raise FlowError(
                 f"numba-cuda failed to compile the flow for the GPU ({words}): its version does not match numpy's or "
                 f"numba's, so run pip install 'vstent[gpu]' again, {ELSE}"

@@ -23,10 +23,9 @@ from vstent.flow.engines import DivergenceError, Outcome, Saved, stepped
 from vstent.flow.indices import neck_diameter_mm, parent_diameter_mm
 from vstent.flow.lattice.checkpoint import pack
 from vstent.flow.lattice.close_up import WIDTH, require_sac
-from vstent.flow.lattice.engine import LatticeBoltzmann
+from vstent.flow.lattice.engine import LatticeBoltzmann, trouble
 from vstent.flow.lattice.state import NECK_INFLOW, Snapshot, State
 from vstent.flow.lattice.stepping import advance, exchange, monitored, snapshot, twin
-from vstent.flow.lattice.trouble import trouble
 from vstent.flow.stopping import SURE, fraction_left, standard_error
 from vstent.kernels.arrays import Floats
 from vstent.units import M3_PER_ML, M_PER_MM
@@ -93,12 +92,7 @@ class BareFlow:
 class Stepping:
     """A lattice and the values read from it since its device was placed.
 
-    Parameters
-    ----------
-    state : State
-        The lattice.
-    reading_steps : int
-        Even number of time steps between two readings.
+    Readings are `reading_steps` time steps apart, an even number.
     """
 
     def __init__(self, state: State, reading_steps: int) -> None:
@@ -107,13 +101,7 @@ class Stepping:
         self._read: Reading | None = None
 
     def advance(self) -> None:
-        """Make the time steps up to the next reading.
-
-        Raises
-        ------
-        DivergenceError
-            The flow diverges.
-        """
+        """Make the time steps up to the next reading; raise a `DivergenceError` if the flow diverges."""
         advance(self.state, self.reading_steps)
         self.state.since_check = 0
         now = snapshot(self.state)
@@ -125,11 +113,6 @@ class Stepping:
     def _values(self, now: Snapshot) -> Floats:
         """Return neck inflow and mean speed in the sac."""
         return monitored(self.state, now)[[NECK_INFLOW, 0]]
-
-    def place(self, case: FlowCase) -> None:
-        """Exchange the device for that of a case; the flow continues from its present state."""
-        exchange(self.state, case)
-        self.forget()
 
     def forget(self) -> None:
         """Forget all readings."""
@@ -147,13 +130,9 @@ class Stepping:
 
 
 def known(values: Floats) -> tuple[float, float]:
-    """Return the average of the last values and its uncertainty as a fraction, the surest of the last few readings.
+    """Return the average of values (n,) and its uncertainty as a fraction, the surest of the last few readings.
 
     What one of the `RECENT` last readings said of the limit holds still: its uncertainty plus the distance from it.
-
-    Parameters
-    ----------
-    values : (n,); values at equal intervals of time.
     """
     recent = [average(values[:n]) for n in range(len(values), max(len(values) - RECENT, 0), -1)]
     mean = recent[0][0]
@@ -162,16 +141,12 @@ def known(values: Floats) -> tuple[float, float]:
 
 
 def average(values: Floats) -> tuple[float, float]:
-    """Return the average of the last values that is known best, and its uncertainty as a fraction.
+    """Return the average of the last values (n,) that is known best, and its uncertainty as a fraction.
 
     Of a flow that converges the last `LATEST` values count, and `CAUTION` times the change that is still expected. Of
     one that oscillates the window counts whose standard error, times `SURE`, is smallest, or before that the last two
     thirds and `RANGES` times their range, unless they drift. The smallest of these uncertainties is returned; inf with
     too few values.
-
-    Parameters
-    ----------
-    values : (n,); values at equal intervals of time.
     """
     late = float(values[-LATEST:].mean())
     # A change passes through zero where a value turns: the worst estimate of the last third counts.
@@ -195,19 +170,8 @@ def _by_range(values: Floats) -> tuple[float, float]:
 class LiveFlow:
     """The flow in one vessel, without a device until `place` is called.
 
-    Parameters
-    ----------
-    case : FlowCase
-        The flow case without a device; it must have a sac and an ostium.
-    told : callable, optional
-        Called with the fraction that is done while the flow of the artery is computed.
-    stored : BareFlow, optional
-        The flow of the same case as computed before; None: it is computed.
-
-    Raises
-    ------
-    FlowError
-        The flow without a device diverges.
+    The case without a device must have a sac and an ostium. `told` is called with the fraction that is done while the
+    flow of the artery is computed, unless it was `stored` before.
     """
 
     def __init__(
@@ -230,12 +194,10 @@ class LiveFlow:
         engine = LatticeBoltzmann(WIDTH * self.cell_size_mm)
         state, left = engine.init(case, None), None
         exchange_s = extended_volume_mm3(case.vessel) * M_PER_MM**3 / (case.inflow_mL_s * M3_PER_ML)
-        while state.time_s < exchange_s and not (left is not None and left < TOLERANCE):
+        while left is None or (state.time_s < exchange_s and not left < TOLERANCE):
             state, left = stepped(engine, state)
             if told is not None:
                 told(min(state.time_s / exchange_s, 1.0))
-        while left is None:
-            state, left = stepped(engine, state)
         return engine.result(state, Outcome(left < TOLERANCE, (left,), 0.0, 0.0))
 
     def place(self, media: tuple[Sheet, ...]) -> None:
@@ -248,7 +210,8 @@ class LiveFlow:
             return
         if self._shown is self._bare:
             self._shown = Stepping(twin(self._bare.state), self._bare.reading_steps)
-        self._shown.place(replace(self.case, media=media))
+        exchange(self._shown.state, replace(self.case, media=media))
+        self._shown.forget()
 
     def advance(self, seconds: float) -> int:
         """Make time steps for about a wall-clock time, take one reading at least, and return the number of steps."""
@@ -297,13 +260,7 @@ class LiveFlow:
         return self._shown.read()
 
     def change(self, name: str) -> tuple[float, float]:
-        """Return the change of a value against the flow without a device, in percent, and its uncertainty in points.
-
-        Parameters
-        ----------
-        name : str
-            ``neck_inflow_mL_s`` or ``sac_velocity_m_s``.
-        """
+        """Return the change of a value against the flow without a device, in percent, and its uncertainty in points."""
         if self._shown is self._bare:
             return 0.0, 0.0
         now, bare = self.read(), self.bare

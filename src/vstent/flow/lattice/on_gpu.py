@@ -44,7 +44,7 @@ class Launch:
 
 
 class Device:
-    """The arrays of a run on the GPU and its kernels (see `state.OnDevice`)."""
+    """The arrays of a run on the GPU and its kernels."""
 
     def __init__(self, state: State) -> None:
         """Copy all arrays that the time steps need to the GPU."""
@@ -102,7 +102,10 @@ class Device:
         return sum(array.nbytes for array in arrays.values())
 
     def advance(self, wanted: Floats, moments: Floats, first_pair: int) -> None:
-        """Make one pair of time steps per row of `wanted` (see `state.OnDevice`)."""
+        """Make one pair of time steps per row of `wanted` (pairs, k) and `moments` (pairs, 3) from `stepping.imposed`.
+
+        The number of the first pair counts from the last check.
+        """
         imposed = np.column_stack([wanted, moments])
         first, self._begun = self._begun, 0
         self.stream.synchronize()
@@ -115,9 +118,10 @@ class Device:
                 self._replay = self._recorded()
 
     def begin(self, wanted: Floats, moments: Floats, first_pair: int) -> bool:
-        """Queue the first pairs of the next `advance` (see `state.OnDevice`).
+        """Queue the first pairs of the next `advance` without waiting for them; return whether there are any.
 
-        Launches one by one would keep the host from its own work, so there only a replay is queued.
+        Until then only `fetch` may be called, which counts them as made. Launches one by one would keep the host from
+        its own work, so only a replay is queued.
         """
         if self._replay:
             rows = np.column_stack([wanted, moments])[:PAIRS]
@@ -164,7 +168,7 @@ class Device:
             yield from ((launch, (part,)) for launch in self._settle)
 
     def rescale(self, state: State, stretch: float, stress: float) -> None:
-        """Take links and screen of `state`, and convert populations to its time step (see `state.OnDevice`)."""
+        """Take links and screen of `state`, and convert populations to its time step."""
         sent, rescale, resend = self._lengthen
         sent(self.stream)
         rescale(self.stream, np.float32(stretch), np.float32(stress))

@@ -13,7 +13,6 @@ from vstent.flow.case import PHASES, FlowCase, FlowField
 from vstent.flow.domain import extended_volume_mm3
 from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.kernels import d3q19
-from vstent.flow.waveform import Waveform
 from vstent.kernels.arrays import Floats, Ints
 from vstent.units import M_PER_MM
 
@@ -58,44 +57,33 @@ def pace(case: FlowCase, cell_size_mm: float, start: FlowField | None, close_up:
     lattice's speed of sound, so that more flow is stored by compressibility. Where a step is longer than the shortest,
     it is limited so that this part stays below `STORED`.
     """
-    pulse = _Pulse(case.pulse)
-    peak_m_s = pulse.peaks_m_s(case, start, close_up)
+    waveform = case.pulse
+    phase_s = waveform.period_s / PHASES
+    time_s = phase_s * (np.arange(PHASES)[:, None] + np.linspace(0, 1, MOMENTS))
+    factor = np.abs(waveform.factor(time_s))
+    peak_m_s = _peaks_m_s(case, factor, start, close_up)
     step_s = np.array([longest_step_s(case, cell_size_mm, peak) for peak in peak_m_s])
     shortest_s = step_s.min()
     way_mm = extended_volume_mm3(case.vessel) / sum(inlet.area_mm2 for inlet in case.vessel.inlets)
-    by_sound_s = pulse.sound_s() * d3q19.SOUND * cell_size_mm / way_mm
+    # The pressure rho L q' / A accelerates the blood and compresses it by rho p / c^2. If sound takes a time T along
+    # the vessel, the stored flow is T^2 q'' / 2.
+    most_per_s2 = np.maximum(np.abs(waveform.curvature_per_s2(time_s)).max(axis=1), 1e-9)
+    sound_s = np.sqrt(2 * STORED * factor.mean(axis=1) / most_per_s2)
+    by_sound_s = sound_s * d3q19.SOUND * cell_size_mm / way_mm
     step_s = np.clip(np.minimum(step_s, by_sound_s), shortest_s, LONGEST * shortest_s)
-    return (2 * np.ceil(0.5 * pulse.phase_s / step_s)).astype(np.int32)
+    return (2 * np.ceil(0.5 * phase_s / step_s)).astype(np.int32)
 
 
-class _Pulse:
-    """A waveform sampled at `MOMENTS` moments of every phase."""
+def _peaks_m_s(case: FlowCase, factor: Floats, start: FlowField | None, close_up: CloseUp | None) -> Floats:
+    """Return the peak speed (PHASES,) in every phase from the factor of the flow rate at moments of it (PHASES, m).
 
-    def __init__(self, waveform: Waveform) -> None:
-        self.phase_s = waveform.period_s / PHASES
-        time_s = self.phase_s * (np.arange(PHASES)[:, None] + np.linspace(0, 1, MOMENTS))
-        self._factor = np.abs(waveform.factor(time_s))
-        self._curvature_per_s2 = np.abs(waveform.curvature_per_s2(time_s))
-
-    def peaks_m_s(self, case: FlowCase, start: FlowField | None, close_up: CloseUp | None) -> Floats:
-        """Return the peak speed (PHASES,) in every phase.
-
-        With a whole cycle in `start`, the speed at both ends of each phase is used. Otherwise the peak speed is scaled
-        with the flow rate, or with that of the phase before if that is higher, because inertia keeps blood moving while
-        the flow rate falls.
-        """
-        within, at_end = self._factor.max(axis=1), self._factor[:, -1]
-        if start is None or len(start.phases) < PHASES:
-            return peak_speed_m_s(case, start, close_up) * np.maximum(within, np.roll(within, 1))
-        ends_m_s = np.array([peak_speed_m_s(case, start.at_phase(phase), close_up) for phase in start.phases])
-        at_ends = np.maximum(at_end, np.roll(at_end, 1))
-        return np.maximum(ends_m_s, np.roll(ends_m_s, 1)) * within / np.maximum(at_ends, 0.5 * within)
-
-    def sound_s(self) -> Floats:
-        """Return the maximum time (PHASES,), s, that sound may take through the vessel in every phase.
-
-        The pressure rho L q' / A accelerates the blood and compresses it by rho p / c^2. If sound takes a time T along
-        the vessel, the stored flow is T^2 q'' / 2.
-        """
-        most_per_s2 = np.maximum(self._curvature_per_s2.max(axis=1), 1e-9)
-        return np.asarray(np.sqrt(2 * STORED * self._factor.mean(axis=1) / most_per_s2))
+    With a whole cycle in `start`, the speed at both ends of each phase is used. Otherwise the peak speed is scaled with
+    the flow rate, or with that of the phase before if that is higher, because inertia keeps blood moving while the flow
+    rate falls.
+    """
+    within, at_end = factor.max(axis=1), factor[:, -1]
+    if start is None or len(start.phases) < PHASES:
+        return peak_speed_m_s(case, start, close_up) * np.maximum(within, np.roll(within, 1))
+    ends_m_s = np.array([peak_speed_m_s(case, start.at_phase(phase), close_up) for phase in start.phases])
+    at_ends = np.maximum(at_end, np.roll(at_end, 1))
+    return np.maximum(ends_m_s, np.roll(ends_m_s, 1)) * within / np.maximum(at_ends, 0.5 * within)

@@ -82,6 +82,7 @@ def field_of(
     domain, vessel = state.domain, state.case.vessel
     section_Pa = domains.section_pressure_Pa(vessel, domain, flow.pressure_Pa)
     inlet_Pa, outlet_Pa = vessel.of_inlets_and_outlets(section_Pa)
+    on_gpu = "" if state.device is None else f" Time steps were launched on the GPU {state.device.how}."
     field = FlowField(
         levels=(Level.of(domain, flow.velocity_m_s, flow.pressure_Pa, flow.mean_speed_m_s),),
         wall=vessel.lumen,
@@ -94,7 +95,7 @@ def field_of(
         blood=state.case.blood,
         is_converged=outcome.is_converged,
         unsettled_fraction=left,
-        advice=advice + _of_the_gpu(state) + _of_the_grid(state, flow, phases),
+        advice=advice + on_gpu + _of_the_grid(state, flow, phases),
         residual=np.array(outcome.residual),
         steps=state.steps,
         seconds=outcome.seconds,
@@ -104,11 +105,6 @@ def field_of(
         neck_inflow_mL_s=flow.neck_inflow_mL_s,
     )
     return field if state.close_up is None else close_ups.assembled(state.close_up, field)
-
-
-def _of_the_gpu(state: State) -> str:
-    """Return a sentence on how a GPU was used; nothing where none was."""
-    return "" if state.device is None else f" Time steps were launched on the GPU {state.device.how}."
 
 
 def _of_the_grid(state: State, flow: Reading, phases: tuple[Phase, ...]) -> str:

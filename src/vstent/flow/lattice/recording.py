@@ -29,12 +29,7 @@ class Pairs(Enum):
 def plan(first_pair: int, count: int) -> Iterator[Pairs]:
     """Yield the sequences that make up `count` pairs of steps; populations are at home after the last.
 
-    Parameters
-    ----------
-    first_pair : int
-        Number of the first pair since the last check; every `DEFER_PAIRS`-th pair is `CORRECTED`.
-    count : int
-        Number of pairs.
+    The number of the first pair counts from the last check; every `DEFER_PAIRS`-th pair is `CORRECTED`.
     """
     pair, end = first_pair, first_pair + count
     while pair < end:
@@ -54,15 +49,8 @@ class NotRecordedError(Exception):
 def recorded(launches: Callable[[], None], stream: Any) -> Callable[[], None]:
     """Return a function that replays what `launches` launches on a stream.
 
-    Parameters
-    ----------
-    launches : launches kernels on `stream` and nothing else. All must have been loaded before.
-    stream : numba.cuda stream; the stream. The replay is queued there.
-
-    Raises
-    ------
-    NotRecordedError
-        When recording is not possible; the stream must not be used again.
+    All kernels must have been loaded before; the replay is queued on the stream. Where recording is not possible, a
+    `NotRecordedError` is raised and the stream must not be used again.
 
     References
     ----------
@@ -75,7 +63,14 @@ def recorded(launches: Callable[[], None], stream: Any) -> Callable[[], None]:
     except ImportError as error:
         raise NotRecordedError(f"cuda.bindings cannot be imported: {error}") from error
     handle = driver.CUstream(int(stream.handle))
-    graph = _captured(driver, launches, handle)
+    # The collector may free an array of another flow meanwhile: only a relaxed capture allows that.
+    _checked(driver.cuStreamBeginCapture(handle, driver.CUstreamCaptureMode.CU_STREAM_CAPTURE_MODE_RELAXED))
+    try:
+        launches()
+    except Exception as error:  # driver, compiler and numba each have their own exception classes
+        driver.cuStreamEndCapture(handle)
+        raise NotRecordedError(f"a kernel could not be launched: {error}") from error
+    (graph,) = _checked(driver.cuStreamEndCapture(handle))
     try:
         (graph_exec,) = _checked(driver.cuGraphInstantiate(graph, 0))
     finally:
@@ -88,27 +83,8 @@ def recorded(launches: Callable[[], None], stream: Any) -> Callable[[], None]:
     return replay
 
 
-def _captured(driver: Any, launches: Callable[[], None], handle: Any) -> Any:
-    """Return the graph of the kernels launched on a stream."""
-    # The collector may free an array of another flow meanwhile: only a relaxed capture allows that.
-    _checked(driver.cuStreamBeginCapture(handle, driver.CUstreamCaptureMode.CU_STREAM_CAPTURE_MODE_RELAXED))
-    try:
-        launches()
-    except Exception as error:  # driver, compiler and numba each have their own exception classes
-        driver.cuStreamEndCapture(handle)
-        raise NotRecordedError(f"a kernel could not be launched: {error}") from error
-    (graph,) = _checked(driver.cuStreamEndCapture(handle))
-    return graph
-
-
 def _checked(result: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return the values of a call of CUDA's driver.
-
-    Raises
-    ------
-    NotRecordedError
-        When the call has failed.
-    """
+    """Return the values of a call of CUDA's driver; a failed one raises a `NotRecordedError`."""
     code, *values = result
     if int(code) != 0:
         raise NotRecordedError(f"the CUDA driver returned {getattr(code, 'name', code)}")

@@ -99,10 +99,7 @@ def build_screen(case: FlowCase, domain: Domain, addressing: Addressing, scales:
 
 
 def on_grid(media: Sequence[Sheet], index: Ints, origin_mm: Floats, cell_size_mm: float) -> GridResistance:
-    """Distribute the resistance of media over grid cells.
-
-    Shapes: `index` (i, j, k), `origin_mm` (3,).
-    """
+    """Distribute the resistance of media over the grid cells numbered by `index` (i, j, k)."""
     alone = [_of_sheet(one, index, origin_mm, cell_size_mm) for one in media]
     return alone[0] if len(alone) == 1 else _combined(alone)
 
@@ -114,7 +111,11 @@ def _of_sheet(one: Sheet, index: Ints, origin_mm: Floats, cell_size_mm: float) -
     blood is dropped. A cell at the rim therefore resists as its neighbours do where the sheet extends over the wall
     beyond the neck.
     """
-    factor, volume = _concentration(one, cell_size_mm), cell_size_mm**3 * M_PER_MM
+    diameter_mm, spacing_mm = one.wire_diameter_mm, one.spacing_mm
+    is_new = np.ones(len(diameter_mm), dtype=bool)  # neighbours on one wire share their concentration
+    is_new[1:] = (diameter_mm[1:] != diameter_mm[:-1]) | (spacing_mm[1:] != spacing_mm[:-1])
+    factor = concentration(diameter_mm[is_new], spacing_mm[is_new], cell_size_mm)[np.cumsum(is_new) - 1]
+    volume = cell_size_mm**3 * M_PER_MM
     along_Pa_s_m, across_Pa_s_m = one.normal_resistance_Pa_s_m, one.tangential_resistance_Pa_s_m
     values = one.area_mm2 / volume, factor * along_Pa_s_m, factor * across_Pa_s_m, one.inertial_loss
     cells = int(index.max(initial=-1)) + 1
@@ -158,12 +159,3 @@ def _combined(alone: Sequence[GridResistance]) -> GridResistance:
     # Of the velocity across the axis, a sheet at an angle to it takes part only with what lies in the sheet.
     spread = total(across * (0.5 + 0.5 * squared) * spread) / np.maximum(total(across), 1e-300)
     return GridResistance(cell, axis, along_axis, across_axis, spread, total(loss))
-
-
-def _concentration(screen: Sheet, cell_size_mm: float) -> Floats:
-    """Return the factor on the drag of every sample (see `concentration`); neighbours on one wire share theirs."""
-    diameter_mm, spacing_mm = screen.wire_diameter_mm, screen.spacing_mm
-    is_new = np.ones(len(diameter_mm), dtype=bool)
-    is_new[1:] = (diameter_mm[1:] != diameter_mm[:-1]) | (spacing_mm[1:] != spacing_mm[:-1])
-    factor = concentration(diameter_mm[is_new], spacing_mm[is_new], cell_size_mm)
-    return np.repeat(factor, np.diff(np.flatnonzero(np.r_[is_new, True])))

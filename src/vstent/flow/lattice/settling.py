@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vstent.flow.lattice.state import Snapshot
-from vstent.flow.stopping import quantities_left, series_left, standard_error
+from vstent.flow.stopping import series_left, standard_error
 from vstent.kernels.arrays import Floats, Ints
 
 CHECKS_APART: Final = 3
@@ -46,22 +46,12 @@ class Mean:
         return max(self.standard_error, SHARE_OF_MEAN_FIELD * self.field_error)
 
 
-def left_to_settle(history: Floats, velocity: Sequence[NDArray[np.float32]]) -> float:
-    """Return the estimated distance of a steady run from convergence.
-
-    Shapes: `history` (checks, quantities), `velocity` (n, 3).
-    """
-    return max(quantities_left(history), SHARE_OF_FIELD * field_left(velocity))
-
-
 def field_left(velocity: Sequence[NDArray[np.float32]]) -> float:
     """Return the expected remaining change of a velocity field as a fraction of it, root mean square.
 
     The field is used beside the monitored means because the change of a mean can pass through zero. Behind a braided
     stent the mean speed in the sac drops quickly and then rises for half a second while the vortex moves to its final
     position. At the turning point the mean seems converged although it will still change by 5 %.
-
-    Shapes: `velocity` (n, 3).
     """
     if len(velocity) < 2 * CHECKS_APART + 1:
         return float("inf")
@@ -89,8 +79,6 @@ def mean_of(blocks: Sequence[Snapshot], history: Floats, sac: Ints) -> Mean:
     At least half of all checks are averaged. The start of the run is left out so that the standard error of the
     remainder is smallest. Where the error exceeds `NO_MEAN`, the last `LATEST` checks are averaged instead (rounded up
     to whole blocks), so that little of the initial transient enters.
-
-    Shapes: `history` (checks, quantities), `sac` (n,).
 
     References
     ----------

@@ -13,8 +13,7 @@ from vstent.flow.domain import Domain
 from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.ends import Ends
 from vstent.flow.lattice.kernels import d3q19, lanes
-from vstent.flow.lattice.scales import Scales
-from vstent.flow.lattice.walls import CURVE, linear_weights, parabolic_weights
+from vstent.flow.lattice.scales import ODD_RATE, Scales
 from vstent.kernels import directions, voxels
 from vstent.kernels.arrays import Bools, Floats, Ints
 
@@ -36,6 +35,8 @@ PAGE, OFF_PAGE = 1024, 216
 pages apart share the same few places of a cache; nineteen populations stored so would make a run a quarter slower."""
 REFILL_BLOCK = 2
 """Edge in cells of the blocks within which the mass lost at interpolated walls is redistributed."""
+CURVE: Final = np.array([1.0, -2.0, 0.0, 1.0, 0.0], np.float32)
+"""Coefficients of the second difference along a link, for the populations a, b, c, e and g (see `d3q19.defer`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,21 +188,16 @@ class Refill:
     """(w,) mass added to every wall cell in every step."""
 
 
-def in_extensions(case: FlowCase, domain: Domain) -> Bools:
-    """Return for every cell (n,) whether it lies in the extension of an opening."""
-    result = np.zeros(len(domain.cells), dtype=bool)
-    for opening, section in zip(case.vessel.openings, domain.sections, strict=True):
-        offset = domain.centers_mm - opening.center_mm
-        ahead_mm = offset @ opening.normal
-        length_mm = float(((section - opening.center_mm) @ opening.normal).max())
-        beside_mm = np.linalg.norm(offset - ahead_mm[:, None] * opening.normal, axis=1)
-        result |= (ahead_mm > 0) & (ahead_mm < length_mm) & (beside_mm < opening.diameter_mm)
-    return result
-
-
 def thickest(case: FlowCase, domain: Domain) -> NDArray[np.float32]:
     """Return the largest grid Reynolds number (n,) of every cell, above which the viscosity is raised."""
-    limit = np.where(in_extensions(case, domain), CELL_REYNOLDS_AT_END, CELL_REYNOLDS)
+    beyond = np.zeros(len(domain.cells), dtype=bool)  # in the extension of an opening
+    for opening, section in zip(case.vessel.openings, domain.sections, strict=True):
+        offset_mm = domain.centers_mm - opening.center_mm
+        ahead_mm = offset_mm @ opening.normal
+        length_mm = float(((section - opening.center_mm) @ opening.normal).max())
+        beside_mm = np.linalg.norm(offset_mm - ahead_mm[:, None] * opening.normal, axis=1)
+        beyond |= (ahead_mm > 0) & (ahead_mm < length_mm) & (beside_mm < opening.diameter_mm)
+    limit = np.where(beyond, CELL_REYNOLDS_AT_END, CELL_REYNOLDS)
     cut = np.zeros(domain.cells.max(axis=0) + 2, dtype=bool)
     cut[tuple(domain.cells[domain.link_cell[domain.link_patch > len(case.vessel.openings)]].T)] = True
     for cells, most in ((CUT_CELLS, CELL_REYNOLDS_AT_END), (CELLS_IN_CUT, CELL_REYNOLDS_IN_CUT)):
@@ -212,13 +208,7 @@ def thickest(case: FlowCase, domain: Domain) -> NDArray[np.float32]:
 
 
 def address(domain: Domain, limit: NDArray[np.float32]) -> Addressing:
-    """Return the memory layout of the populations of a domain.
-
-    Parameters
-    ----------
-    limit : (n,) float32; largest grid Reynolds number of every cell (see `thickest`). A segment contains only cells
-        with equal values.
-    """
+    """Return the memory layout of the populations of a domain; each segment has one `limit` (see `thickest`)."""
     cells = domain.cells
     inside = np.zeros(cells.max(axis=0) + 3, dtype=bool)
     inside[tuple(cells.T)] = True
@@ -232,31 +222,25 @@ def address(domain: Domain, limit: NDArray[np.float32]) -> Addressing:
     is_new = (np.diff(cells, axis=0) != (0, 0, 1)).any(axis=1) | (np.diff(limit) != 0)
     first: Ints = np.flatnonzero(np.r_[True, is_new])
     length = np.diff(np.r_[first, len(cells)])
-    first, length = _cut(first, length)
+    pieces = -(-length // d3q19.SEGMENT)
+    owner = np.repeat(np.arange(len(first)), pieces)
+    offset = d3q19.SEGMENT * (np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces))
+    first, length = first[owner] + offset, np.minimum(length[owner] - offset, d3q19.SEGMENT)
     start = cells[first]
     behind = [number[tuple((start - c).T)] for c in directions.VELOCITIES]
-    septa = _septa(domain, number, stride)
-    links = _link_addresses(domain, number, inside, stride, septa)
-    to_int = np.int32
+    q, cell = domain.septum_direction, cells[domain.septum_cell]
+    here, ahead = (number[tuple(x.T)] for x in (cell, cell + directions.VELOCITIES[q]))
+    septa = np.stack([d3q19.OPPOSITE[q] * stride + here, q * stride + ahead]).astype(np.int32)
     return Addressing(
         stride,
         place,
-        length.astype(to_int),
-        first.astype(to_int),
+        length.astype(np.int32),
+        first.astype(np.int32),
         d3q19.addresses(place[first], behind, stride),
-        *links,
+        *_link_addresses(domain, number, inside, stride, septa),
         septa,
         domain.septum_cell,
     )
-
-
-def _cut(first: Ints, length: Ints) -> tuple[Ints, Ints]:
-    """Return first cell and length of the segments after splitting those longer than `d3q19.SEGMENT`."""
-    pieces = -(-length // d3q19.SEGMENT)
-    owner = np.repeat(np.arange(len(first)), pieces)
-    rank = np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    start = rank * d3q19.SEGMENT
-    return first[owner] + start, np.minimum(length[owner] - start, d3q19.SEGMENT)
 
 
 def _link_addresses(
@@ -280,14 +264,6 @@ def _link_addresses(
         q * stride + behind,
     ]
     return np.stack(rows, axis=1).astype(np.int32), has_one, has_two
-
-
-def _septa(domain: Domain, number: Ints, stride: int) -> Ints:
-    """Return the addresses (2, t) of the populations that cells on both sides of a septum would exchange."""
-    q = domain.septum_direction
-    cell = domain.cells[domain.septum_cell]
-    here, ahead = (number[tuple(x.T)] for x in (cell, cell + directions.VELOCITIES[q]))
-    return np.stack([d3q19.OPPOSITE[q] * stride + here, q * stride + ahead]).astype(np.int32)
 
 
 def build_links(case: FlowCase, grid: Grid, scales: Scales, close_up: CloseUp | None) -> Links:
@@ -326,10 +302,54 @@ def build_links(case: FlowCase, grid: Grid, scales: Scales, close_up: CloseUp | 
     )
 
 
-def build_refill(grid: Grid) -> Refill:
-    """Return the redistribution of the mass lost at the walls of a grid, with nothing lost yet."""
-    place, groups = grid.groups
-    return Refill(place, groups, np.zeros(len(groups[1]), np.float32), np.zeros(len(place), np.float32))
+def linear_weights(fraction: Floats, has_one: NDArray[np.bool_]) -> Floats:
+    """Return the weights (l, 3) of linearly interpolated bounce-back for populations a, b and c (see `d3q19.paths`).
+
+    A link whose wall is nearer than half-way needs the cell behind. Where that is not blood, half-way bounce-back is
+    used.
+
+    References
+    ----------
+    Bouzidi, Firdaouss and Lallemand 2001, Phys. Fluids 13, 3452, eq. 5.
+    """
+    zero = np.zeros_like(fraction)
+    near = np.stack([2 * fraction, 1 - 2 * fraction, zero], axis=1)
+    far = np.stack([0.5 / fraction, zero, 1 - 0.5 / fraction], axis=1)
+    weight = np.where(fraction[:, None] < 0.5, near, far)
+    weight[~has_one & (fraction < 0.5)] = (1.0, 0.0, 0.0)
+    return weight
+
+
+def quadratic_weights(fraction: Floats) -> Floats:
+    """Return the weights (l, 5) of quadratically interpolated bounce-back for a, b, c, e and g (see `d3q19.defer`).
+
+    References
+    ----------
+    Lallemand and Luo 2003, J. Comput. Phys. 184, 406, eq. 10.
+    """
+    x, zero = fraction, np.zeros_like(fraction)
+    near = np.stack([x * (1 + 2 * x), 1 - 4 * x**2, zero, -x * (1 - 2 * x), zero], axis=1)
+    far = np.stack([1 / (x * (2 * x + 1)), zero, (2 * x - 1) / x, zero, (1 - 2 * x) / (1 + 2 * x)], axis=1)
+    return np.where(x[:, None] < 0.5, near, far)
+
+
+def parabolic_weights(fraction: Floats, relaxation_steps: float) -> tuple[Floats, Floats]:
+    """Return the weights of bounce-back that is exact for a parabolic velocity along the link.
+
+    Quadratic interpolation alone leaves a slip velocity of up to an eighth of the squared grid spacing times the flow's
+    curvature. The reason is that the populations carry, beside the velocity, second differences and the part that the
+    odd relaxation rate has not yet relaxed. The second difference a - 2 b + e compensates for both. Its viscous part is
+    a compromise between a plane channel and a tube; determining it from the populations would be wrong where the force
+    of a screen meets the wall.
+
+    References
+    ----------
+    Ginzburg and d'Humieres 2003, Phys. Rev. E 68, 066614, sec. III.
+    """
+    x, even, odd = fraction, relaxation_steps - 0.5, 1 / ODD_RATE - 0.5
+    per = 1 / np.maximum(1, x * (2 * x + 1))
+    viscous = even * (odd + np.abs(x - 0.5)) * per
+    return quadratic_weights(fraction) + np.outer(x * (1 - x) * per - viscous, CURVE), viscous
 
 
 def _grouped(group: Ints) -> tuple[Ints, Ints]:

@@ -5,7 +5,7 @@ A *check* is a moment at which the monitored quantities are recorded and converg
 
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +16,7 @@ from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.scales import Scales
 from vstent.flow.lattice.screen import ScreenEntries
-from vstent.flow.lattice.setup import (
-    Addressing,
-    Links,
-    Refill,
-)
+from vstent.flow.lattice.setup import Addressing, Links, Refill
 from vstent.kernels.arrays import Floats, Ints
 
 DEFER_PAIRS = 8
@@ -114,41 +110,6 @@ class Snapshot:
         return not np.abs(self.velocity).max() < TOO_FAST * d3q19.SOUND  # the comparison is false for nan, too
 
 
-class OnDevice(Protocol):
-    """A run whose arrays are on a GPU."""
-
-    def advance(self, wanted: Floats, moments: Floats, first_pair: int) -> None:
-        """Make one pair of time steps per row of `wanted`.
-
-        Parameters
-        ----------
-        wanted, moments : (pairs, k), (pairs, 3); boundary values from `stepping.imposed`.
-        first_pair : number of the first pair, counted from the last check.
-        """
-
-    def begin(self, wanted: Floats, moments: Floats, first_pair: int) -> bool:
-        """Queue the first pairs of the next `advance`, without waiting for them; return whether there are any.
-
-        Until then only `fetch` may be called, which counts them as made. The arguments are those of `advance`.
-        """
-
-    def read(self) -> tuple[NDArray[np.float32], NDArray[np.float32], Floats]:
-        """Return density deviation (n,) and momentum (n, 3) of every cell, and the flow rate (k,) out of every end."""
-
-    def read_times(self) -> NDArray[np.float32]:
-        """Return the relaxation times (e,) of shear-thinning blood in the cells of the screen."""
-
-    def rescale(self, state: "State", stretch: float, stress: float) -> None:
-        """Take links and screen of `state`, and convert populations to its time step."""
-
-    @property
-    def how(self) -> str:
-        """Return in words how the host launches the time steps."""
-
-    def fetch(self, state: "State") -> None:
-        """Copy the arrays that the time steps change back to `state`, and count the pairs that were begun."""
-
-
 @dataclass(eq=False)
 class State:
     """A run in progress; the populations and the source terms of the links change in place.
@@ -200,8 +161,8 @@ class State:
     """Run time of the time steps."""
     begun_s: float | None = None
     """Time at which a GPU began the next time steps, which it makes while the host judges the last check; else None."""
-    device: "OnDevice | None" = None
-    """The run on a GPU, once it has been copied there."""
+    device: Any = None
+    """The run on a GPU (`on_gpu.Device`), once it has been copied there; else None."""
 
     @property
     def steps_per_check(self) -> int:

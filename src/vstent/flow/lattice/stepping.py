@@ -20,8 +20,8 @@ from vstent.flow.lattice.kernels import d3q19, lanes
 from vstent.flow.lattice.kernels.warm import keep_flow
 from vstent.flow.lattice.scales import ODD_RATE, Scales
 from vstent.flow.lattice.screen import build_screen
-from vstent.flow.lattice.setup import Grid, address, build_links, build_refill, thickest
-from vstent.flow.lattice.state import DEFER_PAIRS, DEFER_PART, OnDevice, Probe, Snapshot, State, speeds
+from vstent.flow.lattice.setup import Grid, Refill, address, build_links, thickest
+from vstent.flow.lattice.state import DEFER_PAIRS, DEFER_PART, Probe, Snapshot, State, speeds
 from vstent.geometry.vessel import Vessel
 from vstent.kernels.arrays import Floats, Ints
 from vstent.units import M_PER_MM
@@ -47,14 +47,8 @@ def build(
 ) -> State:
     """Set up a run: grid, memory layout, walls, openings, screen and initial flow.
 
-    Parameters
-    ----------
-    cell_size_mm : grid spacing.
-    check_s : time between checks.
-    pace : (m,); number of time steps from each check to the next; even; repeated cyclically.
-    close_up : refined region and the flow around it; None: the grid covers the whole vessel.
-    start : initial flow, on any grid; None: at rest.
-    kept : number of last checks that are kept.
+    `check_s` is the time between checks and `pace` (m,) the even numbers of time steps from each to the next, repeated
+    cyclically. The last `kept` checks are kept. Without a `start` the run begins at rest.
     """
     if case.numerics.device_gpu:
         require_gpu()
@@ -64,6 +58,10 @@ def build(
     domain, addressing = grid.domain, grid.addressing
     links = build_links(case, grid, scales, close_up)
     screen = build_screen(case, domain, addressing, scales)
+    points_mm, area_mm2 = np.zeros((0, 3)), np.zeros((0, 3))
+    if case.ostium is not None:
+        points_mm, area_mm2 = sampling.surface_samples(case.ostium, domain.cell_size_mm)
+    place, groups = grid.groups
     state = State(
         case=case,
         close_up=close_up,
@@ -73,8 +71,8 @@ def build(
         built=(links, screen),
         links=links,
         screen=screen,
-        probe=_probe(case, domain),
-        refill=build_refill(grid),
+        probe=Probe(domains.cells_of_sac(case, domain), domain.places(points_mm), area_mm2),
+        refill=Refill(place, groups, np.zeros(len(groups[1]), np.float32), np.zeros(len(place), np.float32)),
         bands=grid.bands,
         limit=grid.limit[addressing.first_cell],
         populations=np.zeros(19 * addressing.stride + lanes.COUNT, dtype=np.float32),
@@ -88,39 +86,22 @@ def build(
 
 
 def prepare(case: FlowCase, cell_size_mm: float) -> None:
-    """Build the grid of a whole vessel, and the distances from its wall that a result needs, for later flows on it.
-
-    Parameters
-    ----------
-    cell_size_mm : grid spacing.
-    """
+    """Build the grid of a whole vessel, and the distances from its wall that a result needs, for later flows on it."""
     grid = _grid(case, cell_size_mm, None)
     _ = grid.bands, grid.groups, grid.domain.index, grid.domain.depth_mm
 
 
 def _grid(case: FlowCase, cell_size_mm: float, close_up: CloseUp | None) -> Grid:
     """Return the grid of a case; that of a whole vessel is the same for all its flows and is built once."""
-    if close_up is not None:
-        return _numbered(case, close_ups.build(case, cell_size_mm, close_up))
-    built = _GRIDS.setdefault(case.vessel, {})
+    built = _GRIDS.setdefault(case.vessel, {}) if close_up is None else {}
     if cell_size_mm not in built:
-        built[cell_size_mm] = _numbered(case, domains.build(case.vessel, cell_size_mm))
+        if close_up is None:
+            domain = domains.build(case.vessel, cell_size_mm)
+        else:
+            domain = close_ups.build(case, cell_size_mm, close_up)
+        limit = thickest(case, domain)
+        built[cell_size_mm] = Grid(domain, limit, address(domain, limit))
     return built[cell_size_mm]
-
-
-def _numbered(case: FlowCase, domain: domains.Domain) -> Grid:
-    """Return the grid of a domain."""
-    limit = thickest(case, domain)
-    return Grid(domain, limit, address(domain, limit))
-
-
-def _probe(case: FlowCase, domain: domains.Domain) -> Probe:
-    """Return the places of the monitored quantities: cells of the sac and points on the ostium."""
-    cells = domains.cells_of_sac(case, domain)
-    if case.ostium is None:
-        return Probe(cells, np.zeros((0, 3)), np.zeros((0, 3)))
-    points_mm, area_mm2 = sampling.surface_samples(case.ostium, domain.cell_size_mm)
-    return Probe(cells, domain.places(points_mm), area_mm2)
 
 
 def _begin_from(state: State, start: FlowField) -> None:
@@ -184,13 +165,11 @@ def step(state: State) -> None:
             state.history.append(np.zeros(0))
             state.since_check = 0
             _keep_pace(state)
-            _begin(state)
+            if state.device is not None:
+                with told():
+                    if state.device.begin(*_pairs(state, _slice_steps(state))):
+                        state.begun_s = perf_counter()
             state.history[-1] = monitored(state, now)
-
-
-def is_at_check(state: State) -> bool:
-    """Return whether the last time steps ended at a check."""
-    return state.since_check == 0
 
 
 def _keep_pace(state: State) -> None:
@@ -225,21 +204,15 @@ def _slice_steps(state: State) -> int:
     return min(steps, state.steps_per_check - state.since_check)
 
 
-def _begin(state: State) -> None:
-    """Let a GPU begin the next time steps, which `advance` finishes; a processor begins nothing."""
-    if state.device is None:
-        return
-    with told():
-        if state.device.begin(*_pairs(state, _slice_steps(state))):
-            state.begun_s = perf_counter()
-
-
 def advance(state: State, steps: int) -> None:
     """Make an even number of time steps."""
     pairs = _pairs(state, steps)
     if state.case.numerics.device_gpu:
         with told():
-            _device(state).advance(*pairs)
+            from vstent.flow.lattice.on_gpu import Device
+
+            state.device = state.device or Device(state)
+            state.device.advance(*pairs)
     else:
         _advance_here(state, *pairs)
     state.steps += steps
@@ -252,10 +225,7 @@ def _pairs(state: State, steps: int) -> tuple[Floats, Floats, int]:
 
 
 def imposed(state: State, steps: Floats | Ints) -> tuple[Floats, Floats]:
-    """Return the boundary values at time steps (t,) since the last check.
-
-    Shapes: `steps` (t,).
-    """
+    """Return the boundary values at time steps (t,) since the last check."""
     links = state.links
     count = len(links.course)
     checks = len(state.history) + steps / state.steps_per_check
@@ -266,21 +236,11 @@ def imposed(state: State, steps: Floats | Ints) -> tuple[Floats, Floats]:
     return factor[:, None] * links.wanted + before + part[:, None] * (after - before), moments
 
 
-def _device(state: State) -> OnDevice:
-    """Return the run on the GPU; the first call copies it there."""
-    from vstent.flow.lattice.on_gpu import Device
-
-    if state.device is None:
-        state.device = Device(state)
-    return state.device
-
-
 def _advance_here(state: State, wanted: Floats, moments: Floats, first_pair: int) -> None:
     """Make pairs of time steps on the CPU; `first_pair` is the number of the first since the last check."""
-    f, links, refill = state.populations, state.links, state.refill
+    f, links, refill, scales = state.populations, state.links, state.refill, state.scales
     a, screen = state.addressing, state.screen
     shares = d3q19.share(a.length, screen.start, state.bands, numba.get_num_threads())
-    scales = state.scales
     relaxation = np.float32(scales.relaxation_steps), scales.thinning, state.limit, np.float32(ODD_RATE)
     cells = a.address, a.length, relaxation, (screen.start, screen.place, screen.entry)
     back = links.path, links.weight, links.source, links.by_layer, refill.place, refill.refill, a.septa
@@ -306,22 +266,17 @@ def _settle(state: State, part: float) -> None:
 def snapshot(state: State) -> Snapshot:
     """Return the present flow; in a screen the velocity includes half of its force."""
     density, velocity, outflow = _read_here(state) if state.device is None else state.device.read()
-    cells = state.screen.cell
+    cells, a = state.screen.cell, state.addressing
     if len(cells):
-        times = _relaxation_times(state, cells)
+        time, law = np.float32(state.scales.relaxation_steps), state.scales.thinning
+        if law[0] == 0:
+            times = np.full(len(cells), time)
+        elif state.device is None:
+            times = d3q19.relaxation_times(state.populations, a.stride, a.place[cells], time, law)
+        else:
+            times = state.device.read_times()
         velocity[cells] = d3q19.resisted(velocity[cells], state.screen.entry, times, np.float32(ODD_RATE))
     return Snapshot(state.scales, velocity, density, outflow)
-
-
-def _relaxation_times(state: State, cells: Ints) -> NDArray[np.float32]:
-    """Return the relaxation times (e,) of cells, which depend on the shear rate in shear-thinning blood."""
-    time, law = np.float32(state.scales.relaxation_steps), state.scales.thinning
-    if law[0] == 0:
-        return np.full(len(cells), time)
-    if state.device is not None:
-        return state.device.read_times()
-    a = state.addressing
-    return np.asarray(d3q19.relaxation_times(state.populations, a.stride, a.place[cells], time, law))
 
 
 def _read_here(state: State) -> tuple[NDArray[np.float32], NDArray[np.float32], Floats]:
@@ -339,9 +294,10 @@ def monitored(state: State, now: Snapshot) -> Floats:
     speed_m_s = speeds(velocity_m_s)
     first_inflow = state.links.patch[np.argmax(state.links.is_inflow)]
     inlet = state.domain.link_cell[state.domain.link_patch == first_inflow]
-    values = [speed_m_s[state.probe.cells].mean(), now.pressure_Pa[inlet].mean(), speed_m_s.mean()]
-    if len(state.probe.ostium_points):
-        at, area_mm2 = state.probe.ostium_points, state.probe.ostium_area_mm2
+    probe = state.probe
+    values = [speed_m_s[probe.cells].mean(), now.pressure_Pa[inlet].mean(), speed_m_s.mean()]
+    if len(probe.ostium_points):
+        at, area_mm2 = probe.ostium_points, probe.ostium_area_mm2
         through_mL_s = sampling.read_through_mL_s(state.domain, velocity_m_s.astype(float), at, area_mm2)
         values.append(sampling.inflow_mL_s(through_mL_s))
     return np.array(values, dtype=float)

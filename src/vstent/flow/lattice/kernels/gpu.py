@@ -33,7 +33,8 @@ from vstent.flow.lattice.kernels.d3q19 import INFLOW, KIND, OPENING, OPPOSITE, P
 THREADS: Final = 8 if config.ENABLE_CUDASIM else 128
 """Number of threads per block; a power of 2. Numba simulates each by a thread of the processor, which is slow."""
 COLUMN: Final = np.array([0, 1, 2, 3, 4, 0, 0, 5, 6, 7, 8, 1, 2, 1, 2, 3, 4, 3, 4], np.int32)
-"""(19,) column of a segment's row of places that holds the neighbour in each direction (see `packing.Layout.rows`)."""
+"""(19,) column of the rows (segments, 9) that holds the neighbour in each direction. A row holds storage place minus
+cell number, the same in a whole segment, of its cells and of their neighbours without a component along z."""
 SHIFT: Final = np.array([0, 0, 0, 0, 0, 1, -1, 0, 0, 0, 0, 1, -1, -1, 1, 1, -1, -1, 1], np.int32)
 """(19,) number of places from there to the neighbour: neighbours along z are adjacent."""
 # fmt: off
@@ -46,7 +47,7 @@ SHIFT: Final = np.array([0, 0, 0, 0, 0, 1, -1, 0, 0, 0, 0, 1, -1, -1, 1, 1, -1, 
     SPECIAL, END_OF_LINK, OPENING_OF_END,
     BLOCKS, END_CELL, FIRST_BLOCK, COUNT, DONE,
     SEPTA, ADDRESS, SLOT, FIRST_LINK, GROUP_LINK, FIRST_MEMBER, GROUP_MEMBER,
-    # Places among the singles: `Packed.link`, refill of special cells, mass lost, `Links.correction`.
+    # Places among the singles: weights and sources of links, refill of special cells, mass lost, `Links.correction`.
     LINK, REFILL, LOST, CORRECTION,
     # Places among the doubles: answers, sums of blocks, boundary values.
     ANSWER, PARTS, IMPOSED,
@@ -266,8 +267,6 @@ def even_step(
     """Make an even step: every cell collides and stores its populations at home, each in the place of its opposite.
 
     A launch takes the host some microseconds for every array, so tables share one array of each type.
-
-    Shapes: `f` (19 * stride,), `shape` (m, o, 2).
     """
     cell = cuda.grid(1)
     if cell >= cells:
