@@ -44,15 +44,15 @@ def add(commands: options.Commands) -> None:
 
 def study(
     path: Path,
-    out: Path,
     settings: "Settings",
     console: "Console",
-    *,
-    is_printed: bool,
-    replaces: bool,
+    arguments: argparse.Namespace,
     injected: "AngiogramSettings | None" = None,
 ) -> "CaseResult":
-    """Run a study, show its progress, write its reports and print its tables; angiograms too where `injected`."""
+    """Run a study, show its progress, write its reports and print its tables; angiograms too where `injected`.
+
+    The arguments state the case folder, and whether results are replaced and the report is printed.
+    """
     from vstent.angiography.filming import FilmSettings
     from vstent.cli.console import angiogram_table, comparison_table, device_sentences, uncertainty_table
     from vstent.reporting.drawing import Drawing
@@ -62,18 +62,20 @@ def study(
     from vstent.study.pipeline import run
     from vstent.study.progress import Progress
 
+    out = arguments.out
+
     def told(now: Progress) -> None:
         console.progress(now)
         if now.computed is not None:  # the pictures are drawn while the measures are computed
             drawing.begin(now.computed)
 
     with console.live(), Drawing() as drawing:
-        case = run(path, out, settings, told, replaces=replaces)
+        case = run(path, out, settings, told, replaces=arguments.replace)
         if injected is not None:
             angiograms = film_case(out, injected, FilmSettings(), console.progress)
             add_measures(case.metrics, {name: one.measures for name, one in angiograms.items()})
         console.progress(Progress("report", 0.0))
-        write_report(case, out, is_printed=is_printed, drawing=drawing)
+        write_report(case, out, is_printed=arguments.pdf, drawing=drawing)
         console.progress(Progress("report", 1.0, str(out / "report.html")))
     console.print(comparison_table(case.metrics))
     for sentence in device_sentences(case.metrics):
@@ -108,8 +110,7 @@ def _run(arguments: argparse.Namespace) -> int:
             console.say(f"Changed since: {difference}.")
         path, settings = record.input, record.settings
     before = finished.begun(arguments, path)
-    asked = {"is_printed": arguments.pdf, "replaces": arguments.replace, "injected": injected}
-    case = study(path, out, settings, console, **asked)
+    case = study(path, settings, console, arguments, injected)
     if arguments.plan:
         write_plan(case, out, date.today().isoformat())
     if arguments.ro_crate:

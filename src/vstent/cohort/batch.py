@@ -23,6 +23,7 @@ from vstent.reporting.figures import patient_picture
 from vstent.study.folder import CACHE
 from vstent.study.pipeline import restore_vessel, run
 from vstent.study.progress import OnProgress, Progress
+from vstent.study.repeat import flat
 from vstent.study.settings import Settings
 from vstent.study.store import Key, Store
 from vstent.study.workers import AbstractWorkers, alone
@@ -188,15 +189,7 @@ def flat_metrics(metrics: Mapping[str, Any], treatment: str) -> Row:
     implants = found.pop("implants")
     parts = {"vessel": metrics["vessel"], BARE: metrics["treatments"].get(BARE, {}).get("flow", {})}
     alone = {"implant": next(iter(implants.values()))} if len(implants) == 1 else {"implants": implants}
-    return _flat(parts | alone | found, "")
-
-
-def _flat(values: Mapping[str, Any], before: str) -> Row:
-    """Return nested values under dotted keys."""
-    row: Row = {}
-    for name, value in values.items():
-        row |= _flat(value, f"{before}{name}.") if isinstance(value, Mapping) else {f"{before}{name}": value}
-    return row
+    return flat(parts | alone | found)
 
 
 def _write_row(task: Task, treatment: str, row: Row) -> None:

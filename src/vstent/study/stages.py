@@ -47,6 +47,11 @@ from vstent.study.settings import Point, Settings
 from vstent.study.store import Key, Store, Unfinished
 from vstent.units import counted
 
+Implants = Mapping[str, Mapping[str, Deployment]]
+"""Deployed implants by treatment and id."""
+Keys = Mapping[str, Key]
+"""Keys of the stages of a study, of `vstent.study.keys`, by name."""
+
 SLOWEST_M_S: Final = 0.01
 """Smallest plausible mean speed at an inlet, in m/s; below it the inflow is taken to be in another unit."""
 FASTEST_M_S: Final = 2.0
@@ -56,7 +61,7 @@ NEAR_MM: Final = 3.0
 """Largest distance from the vessel wall, in mm, at which another interpretation of a point is proposed."""
 
 
-def find_anatomy(path: Path, settings: Settings, store: Store, keys: Mapping[str, Key]) -> Anatomy:
+def find_anatomy(path: Path, settings: Settings, store: Store, keys: Keys) -> Anatomy:
     """Return the anatomy of an input, stored or computed; the store writes a new one when `save_deferred` is called.
 
     Where no vessel is found at the point `at_mm`, the error proposes the same point in another frame or as a voxel
@@ -111,7 +116,7 @@ def _readings(path: Path, settings: Settings) -> Iterator[tuple[str, Point]]:
     yield "with the second sign changed", (x, -y, z)
 
 
-def find_vessel(path: Path, settings: Settings, store: Store, keys: Mapping[str, Key]) -> Vessel:
+def find_vessel(path: Path, settings: Settings, store: Store, keys: Keys) -> Vessel:
     """Return the traced vessel of an input, stored or computed; the store writes a new one as in `find_anatomy`."""
     traced = store.find(VESSEL, keys[VESSEL], Vessel)
     if traced is not None:
@@ -136,7 +141,7 @@ def _vessel(path: Path, settings: Settings) -> Vessel:
     return read_vessel(path, **asdict(settings.input), at_mm=at_mm)
 
 
-def finished_anatomy(out: Path, store: Store, keys: Mapping[str, Key]) -> Anatomy:
+def finished_anatomy(out: Path, store: Store, keys: Keys) -> Anatomy:
     """Return the stored anatomy of a finished run of a case folder; ReadError is raised where it is missing."""
     anatomy = store.find(ANATOMY, keys[ANATOMY], Anatomy)
     if anatomy is None:
@@ -145,7 +150,7 @@ def finished_anatomy(out: Path, store: Store, keys: Mapping[str, Key]) -> Anatom
 
 
 def deploy_all(
-    anatomy: Anatomy, settings: Settings, store: Store, keys: Mapping[str, Key]
+    anatomy: Anatomy, settings: Settings, store: Store, keys: Keys
 ) -> tuple[dict[str, dict[str, Deployment]], dict[str, str]]:
     """Return the implants of every treatment, stored or deployed, and the reasons why treatments do not fit, by name.
 
@@ -235,12 +240,7 @@ def engine_folders(out: Path, settings: Settings) -> dict[str, Path]:
 
 
 def compute_flows(
-    out: Path,
-    anatomy: Anatomy,
-    implants: Mapping[str, Mapping[str, Deployment]],
-    settings: Settings,
-    store: Store,
-    keys: Mapping[str, Key],
+    out: Path, anatomy: Anatomy, implants: Implants, settings: Settings, store: Store, keys: Keys
 ) -> tuple[dict[str, FlowField], dict[str, str]]:
     """Return the flow in the bare artery and with every treatment, and the reasons why others failed, by name.
 
@@ -317,11 +317,7 @@ def plan_flows(anatomy: Anatomy, stents: Mapping[str, Sequence[Stent]], settings
 
 
 def vary_all(
-    anatomy: Anatomy,
-    implants: Mapping[str, Mapping[str, Deployment]],
-    settings: Settings,
-    store: Store,
-    keys: Mapping[str, Key],
+    anatomy: Anatomy, implants: Implants, settings: Settings, store: Store, keys: Keys
 ) -> dict[str, dict[str, Any]]:
     """Return the uncertainties of every treatment with one implant, by name."""
     if settings.uncertainty is None:
@@ -352,7 +348,7 @@ def vary_all(
 
 def measure_study(
     anatomy: Anatomy,
-    implants: Mapping[str, Mapping[str, Deployment]],
+    implants: Implants,
     fields: Mapping[str, FlowField],
     settings: Settings,
     varied: Mapping[str, Any],
