@@ -23,12 +23,8 @@ PDF: Final = "also write the report as report.pdf"
 
 def add(commands: options.Commands) -> None:
     """Add the command."""
-    parser = options.add_command(
-        commands,
-        "run",
-        "Deploy stents in a patient's artery, compute the flow before and after, and write a report.",
-        "run scan/ --device silk --device enterprise --out case",
-    )
+    text = "Deploy stents in a patient's artery, compute the flow before and after, and write a report."
+    parser = options.add_command(commands, "run", text, "run scan/ --device silk --device enterprise --out case")
     options.add_case(parser)
     options.add_settings(parser, *options.VESSEL, *options.STUDY)
     options.add_flag(parser, "angiogram", "also carry contrast through the flows and film it")
@@ -36,9 +32,8 @@ def add(commands: options.Commands) -> None:
     options.add_flag(parser, "pdf", PDF)
     options.add_flag(parser, "plan", "write the plan of every device on one page, plan.pdf, without the flow")
     options.add_flag(parser, "ro-crate", "also describe the case folder as an RO-Crate")
-    parser.add_argument(
-        "--input", dest="moved_to", type=Path, metavar="PATH", help="present place of the input of a run.json to repeat"
-    )
+    text = "present place of the input of a run.json to repeat"
+    parser.add_argument("--input", dest="moved_to", type=Path, metavar="PATH", help=text)
     parser.set_defaults(command=_run, answered=finished.answered)
 
 

@@ -92,10 +92,10 @@ def run_cohort(tasks: Sequence[Task], out: Path, workers: AbstractWorkers, progr
     VstentError
         The connection to the cluster is lost; finished rows are kept.
     """
-    for done, ended in enumerate(workers.do(work, tasks), start=1):
-        task = tasks[ended.number]
+    for done, (number, fault) in enumerate(workers.do(work, tasks), start=1):
+        task = tasks[number]
         for treatment in task.keys.keys() - read_rows(task.folder, task.keys).keys():
-            _write_row(task, treatment, {"outcome": LOST, "stage": "", "sentence": ended.fault})
+            _write_row(task, treatment, {"outcome": LOST, "stage": "", "sentence": fault})
         progress(done, len(tasks), task.case.name, collect([task.case], out))
 
 

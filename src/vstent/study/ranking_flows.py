@@ -111,12 +111,12 @@ def compute_missing(
         folder = Path(name)
         write_pickle(folder / COMMON, (anatomy, settings, wanted, bare, has_contrast, threads))
         tasks = [FlowTask(folder, number) for number in range(len(wanted))]
-        for done, ended in enumerate(workers.do(work, tasks), start=1):
-            candidate = wanted[ended.number]
-            if ended.fault:
-                stored.lose(candidate, ended.fault)
+        for done, (number, fault) in enumerate(workers.do(work, tasks), start=1):
+            candidate = wanted[number]
+            if fault:
+                stored.lose(candidate, fault)
             else:
-                stored[candidate] = _read_pickle(folder / f"{ended.number}{RESULT}")
+                stored[candidate] = _read_pickle(folder / f"{number}{RESULT}")
             progress(before + done, total, candidate.label)
 
 

@@ -33,7 +33,7 @@ from vstent.flow.indices import indices, ratios
 from vstent.flow.ostium import ostium, surfaces_beside
 from vstent.flow.problem import flow_case, vessel_case
 from vstent.flow.settings import FlowSettings
-from vstent.flow.simulation import OnProgress, foretell_cost, simulate_case
+from vstent.flow.simulation import foretell_cost, simulate_case
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.files import is_surface_file
 from vstent.io.images import read_image
@@ -44,7 +44,7 @@ from vstent.study.folder import flow_folder
 from vstent.study.keys import ANATOMY, VESSEL, stage_name
 from vstent.study.outputs import write_field
 from vstent.study.settings import Point, Settings
-from vstent.study.store import Key, Store, Unfinished
+from vstent.study.store import Key, Store
 from vstent.units import counted
 
 Implants = Mapping[str, Mapping[str, Deployment]]
@@ -262,16 +262,10 @@ def compute_flows(
                 if name == BARE:
                     plan_flows(anatomy, stents, settings.flow, store)
                 try:
+                    told, unfinished = partial(_tell_flow, store, stage), store.unfinished(stage, keys[stage])
+                    run = {"start": fields.get(BARE), "progress": told, "checkpoint": unfinished}
                     with store.stage(stage) as tell:
-                        field = compute_flow(
-                            anatomy,
-                            stents[name],
-                            settings.flow,
-                            start=fields.get(BARE),
-                            folder=folders[name],
-                            progress=partial(_tell_flow, store, stage),
-                            unfinished=store.unfinished(stage, keys[stage]),
-                        )
+                        field = compute_flow(anatomy, stents[name], settings.flow, folder=folders[name], **run)
                         tell(field.advice)
                 except FlowError as error:
                     if name == BARE:
@@ -293,19 +287,9 @@ def _tell_flow(store: Store, stage: str, now: FlowProgress) -> None:
     store.progress(stage, min(now.fraction, 0.99), "", residual=residual, seconds_left=now.seconds_left)
 
 
-def compute_flow(
-    anatomy: Anatomy,
-    stents: Sequence[Stent],
-    settings: FlowSettings,
-    *,
-    start: FlowField | None,
-    folder: Path,
-    progress: OnProgress,
-    unfinished: Unfinished,
-) -> FlowField:
-    """Compute one flow; an unfinished one resumes."""
-    case = flow_case(anatomy, stents, settings)
-    return simulate_case(case, start=start, folder=folder, progress=progress, checkpoint=unfinished)
+def compute_flow(anatomy: Anatomy, stents: Sequence[Stent], settings: FlowSettings, **how: Any) -> FlowField:
+    """Compute one flow as `simulate_case` does; an unfinished one resumes."""
+    return simulate_case(flow_case(anatomy, stents, settings), **how)
 
 
 def plan_flows(anatomy: Anatomy, stents: Mapping[str, Sequence[Stent]], settings: FlowSettings, store: Store) -> None:
