@@ -10,7 +10,7 @@ from faults import DONE, FAULTS, Fault, artery, play
 
 from vstent.io.writers import write_stl
 from vstent.study.folder import CACHE, INPUT
-from vstent.study.former import BEGUN
+from vstent.study.repeat import BEGUN
 
 KEPT = {"disk full", "kept stages that unpack to 16 GB"}
 """Faults after which the case folder holds what was finished before."""

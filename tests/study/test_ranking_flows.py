@@ -15,7 +15,7 @@ from vstent.plan.rank import Ranking, rank
 from vstent.plan.rank_flow import chosen_of, coverage_of, is_similar, rank_flows
 from vstent.study import ranking_flows
 from vstent.study.folder import CACHE
-from vstent.study.ranking_flows import Common, FlowStore, FlowTask, compute_missing, parallel_flows
+from vstent.study.ranking_flows import FlowStore, FlowTask, compute_missing, parallel_flows
 from vstent.study.store import Key
 from vstent.study.workers import Processes
 
@@ -62,7 +62,7 @@ def test_a_flow_starts_from_the_most_similar_one_that_is_finished(tmp_path, monk
     monkeypatch.setattr(ranking_flows, "flow_with", noting)
     monkeypatch.setattr(ranking_flows, "coverage_of", lambda candidate: candidate.covers)
     candidates = tuple(SimpleNamespace(covers=one) for one in covered)
-    common = Common("anatomy", "settings", candidates, "bare", has_contrast=True, threads=1)
+    common = ("anatomy", "settings", candidates, "bare", True, 1)
     ranking_flows.write_pickle(tmp_path / ranking_flows.COMMON, common)
     for number in (0, 1, 3, 2):
         ranking_flows.work(FlowTask(tmp_path, number))

@@ -36,9 +36,8 @@ def add_injection(parser: argparse.ArgumentParser) -> None:
     options.add_number(group, "start", start, 0.0, Limits("s", 0.0, 60.0))
     shape = group.add_mutually_exclusive_group()
     options.add_flag(shape, "gamma", "gamma-variate injection curve (default: constant rate)")
-    shape.add_argument(
-        "--curve", type=Path, metavar="CSV", help="time (s) and iodine concentration at the inlet (mg/mL), two columns"
-    )
+    text = "time (s) and iodine concentration at the inlet (mg/mL), two columns"
+    shape.add_argument("--curve", type=Path, metavar="CSV", help=text)
     window = "time to compute from the start of the injection"
     options.add_number(group, "window", window, 6.0, Limits("s", 0.1, 120.0))
     options.add_flag(group, "preview", "use a grid twice as coarse, for a first look")
@@ -47,11 +46,8 @@ def add_injection(parser: argparse.ArgumentParser) -> None:
 def _add_film(parser: argparse.ArgumentParser) -> None:
     """Add the options on films."""
     group = parser.add_argument_group("film")
-    group.add_argument(
-        "--view",
-        metavar="ANGLES",
-        help='C-arm direction, such as "LAO 30 CRA 10", AP or lateral (default: the neck in profile, proposed)',
-    )
+    text = 'C-arm direction, such as "LAO 30 CRA 10", AP or lateral (default: the neck in profile, proposed)'
+    group.add_argument("--view", metavar="ANGLES", help=text)
     options.add_number(group, "frame-rate", "frames per second", 7.5, Limits("Hz", above=0.0))
     options.add_flag(group, "wires", "show the wires of the device (default: subtracted)")
     options.add_flag(group, "vessel", "show the vessel faintly (default: subtracted)")
@@ -60,12 +56,8 @@ def _add_film(parser: argparse.ArgumentParser) -> None:
     to_vessel = "distance from source to isocenter, where the vessel is"
     options.add_number(group, "source-isocenter", to_vessel, 750.0, Limits("mm", above=0.0))
     options.add_number(group, "energy", "photon energy", 50.0, Limits("keV", above=0.0))
-    group.add_argument(
-        "--dicom-like",
-        type=Path,
-        metavar="FILE",
-        help="DICOM file whose patient and study the films are to belong to (default: no patient data)",
-    )
+    text = "DICOM file whose patient and study the films are to belong to (default: no patient data)"
+    group.add_argument("--dicom-like", type=Path, metavar="FILE", help=text)
 
 
 def given_angiogram(arguments: argparse.Namespace) -> "AngiogramSettings":

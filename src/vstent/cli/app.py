@@ -16,19 +16,12 @@ LAST_PORT: Final = 65535
 def add(commands: options.Commands) -> None:
     """Add the command."""
     parser = options.add_command(commands, "app", "Plan a stent on a page in the browser.", "app scan/")
-    parser.add_argument(
-        "input", type=Path, nargs="?", help="scan, surface or case folder (default: drop one on the page)"
-    )
-    parser.add_argument(
-        "--cases",
-        type=Path,
-        default=Path("vstent-cases"),
-        metavar="DIR",
-        help="folder of the cases (default: vstent-cases)",
-    )
-    parser.add_argument(
-        "--host", default="127.0.0.1", help="address of the server (default: 127.0.0.1, this machine only)"
-    )
+    text = "scan, surface or case folder (default: drop one on the page)"
+    parser.add_argument("input", type=Path, nargs="?", help=text)
+    text = "folder of the cases (default: vstent-cases)"
+    parser.add_argument("--cases", type=Path, default=Path("vstent-cases"), metavar="DIR", help=text)
+    text = "address of the server (default: 127.0.0.1, this machine only)"
+    parser.add_argument("--host", default="127.0.0.1", help=text)
     parser.add_argument("--port", type=_port, default=0, help="port of the server (default: a free one)")
     options.add_flag(parser, "no-browser", "print the address of the page without opening it")
     parser.set_defaults(command=_app)

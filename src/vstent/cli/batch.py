@@ -10,20 +10,12 @@ from vstent.cli import options
 
 def add(commands: options.Commands) -> None:
     """Add the command."""
-    parser = options.add_command(
-        commands,
-        "batch",
-        "Run many cases with every device, and write one table and a cohort report.",
-        "batch cohort/ --device silk --no-flow --out study --jobs 2",
-    )
-    parser.add_argument(
-        "cohort",
-        type=Path,
-        help="folder of scans or surfaces, or a CSV file with a column `input`, and columns named like options",
-    )
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="output folder; a folder that exists is continued"
-    )
+    text = "Run many cases with every device, and write one table and a cohort report."
+    parser = options.add_command(commands, "batch", text, "batch cohort/ --device silk --no-flow --out study --jobs 2")
+    text = "folder of scans or surfaces, or a CSV file with a column `input`, and columns named like options"
+    parser.add_argument("cohort", type=Path, help=text)
+    text = "output folder; a folder that exists is continued"
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=text)
     options.add_settings(parser, *options.VESSEL, *options.STUDY)
     working = parser.add_argument_group("parallel work")
     options.add_workers(working)

@@ -79,10 +79,9 @@ class Console:
     @contextmanager
     def live(self) -> Iterator[None]:
         """Show a spinner with the current stage on a terminal."""
-        with self._err.status("starting") as status:
-            self._status = status
+        with self._err.status("starting") as self._status:
             yield
-            self._status = None
+        self._status = None
 
     def progress(self, told: Progress) -> None:
         """Show the progress of a stage: on a terminal in the spinner, else a line every `QUIET_S`."""
@@ -157,15 +156,13 @@ def device_sentences(metrics: Mapping[str, Any]) -> list[str]:
             if implant.get("bands"):
                 title = name if len(treatment["implants"]) == 1 else f"{key} of {name}"
                 by_device.setdefault(implant["bands"]["device"], {})[title] = implant
-    return [
-        _spaced(
-            " ".join(
-                how_sure(implant, title if len(implants) > 1 else "", is_told=number > 0)
-                for number, (title, implant) in enumerate(implants.items())
-            )
-        )
-        for implants in by_device.values()
-    ]
+    sentences = []
+    for implants in by_device.values():
+        titles = implants if len(implants) > 1 else [""]
+        parts = zip(implants.values(), titles, strict=True)
+        told = (how_sure(implant, title, is_told=n > 0) for n, (implant, title) in enumerate(parts))
+        sentences.append(_spaced(" ".join(told)))
+    return sentences
 
 
 def _add_flow_rows(table: Table, metrics: Mapping[str, Any], titles: Mapping[str, str]) -> None:

@@ -24,8 +24,8 @@ def _demo(arguments: argparse.Namespace) -> int:
 
     scan, settings = write_scan(arguments.out / "scan"), options.given_settings(arguments)
     before = finished.begun(arguments, scan)
-    console, asked = Console(), {"is_printed": arguments.pdf, "replaces": arguments.replace}
-    case = run.study(scan, arguments.out, settings, console, **asked)
+    console = Console()
+    case = run.study(scan, settings, console, arguments)
     console.print(truth_table(truth(case)))
     if case.failures:
         return 1

@@ -13,9 +13,8 @@ def add(commands: options.Commands) -> None:
     commands_of_devices = parser.add_subparsers(metavar="COMMAND")
     text = "Add devices of your own to the catalogue."
     adding = options.add_command(commands_of_devices, "add", text, "devices add mine.toml")
-    adding.add_argument(
-        "file", type=Path, help="TOML file in the form of vstent's catalogue.toml: every number with its source"
-    )
+    text = "TOML file in the form of vstent's catalogue.toml: every number with its source"
+    adding.add_argument("file", type=Path, help=text)
     adding.set_defaults(command=_add)
     fitting = options.add_command(
         commands_of_devices,
@@ -23,16 +22,13 @@ def add(commands: options.Commands) -> None:
         "Fit the numbers of a device to measurements, and write a catalogue entry and a picture.",
         "devices fit measurements.csv --like pipeline --out mine.toml",
     )
-    fitting.add_argument(
-        "file", type=Path, nargs="?", metavar="MEASUREMENTS.csv", help="measured values, one row per tube"
-    )
+    text = "measured values, one row per tube"
+    fitting.add_argument("file", type=Path, nargs="?", metavar="MEASUREMENTS.csv", help=text)
     fitting.add_argument("--like", metavar="DEVICE", help="similar device: its numbers are the first guess")
-    fitting.add_argument(
-        "--out", type=Path, metavar="FILE", help="entry to write (.toml); the picture has its name (.png)"
-    )
-    fitting.add_argument(
-        "--name", help="name of the device (default: that of the similar device, followed by measured)"
-    )
+    text = "entry to write (.toml); the picture has its name (.png)"
+    fitting.add_argument("--out", type=Path, metavar="FILE", help=text)
+    text = "name of the device (default: that of the similar device, followed by measured)"
+    fitting.add_argument("--name", help=text)
     options.add_flag(fitting, "all-sizes", "offer the device in all sizes of the similar one")
     options.add_flag(fitting, "template", "print an example of the CSV file")
     fitting.set_defaults(command=_fit)

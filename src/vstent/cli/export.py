@@ -10,32 +10,22 @@ from vstent.fields import Limits, Option, whole
 
 def add(commands: options.Commands) -> None:
     """Add the command and its subcommands."""
-    parser = options.add_command(
-        commands, "export", "Write a case for other flow solvers.", "export openfoam case --out foam"
-    )
+    text = "Write a case for other flow solvers."
+    parser = options.add_command(commands, "export", text, "export openfoam case --out foam")
     kinds = parser.add_subparsers(required=True, metavar="WHAT")
-    foam = options.add_command(
-        kinds,
-        "openfoam",
-        "Write an OpenFOAM case folder: mesh settings, boundary conditions and scripts (lengths in m).",
-        "export openfoam case --device silk --out foam",
-    )
+    text = "Write an OpenFOAM case folder: mesh settings, boundary conditions and scripts (lengths in m)."
+    foam = options.add_command(kinds, "openfoam", text, "export openfoam case --device silk --out foam")
     _add_input(foam)
     unsupported = ("no-flow", "engine", "refine-sac", "gpu")
     options.add_settings(foam, *options.VESSEL, "treatments", "flow", without=unsupported)
     group = foam.add_argument_group("OpenFOAM")
-    group.add_argument(
-        "--flavour", choices=("com", "org"), help="openfoam.com or openfoam.org (default: the one installed, else com)"
-    )
+    text = "openfoam.com or openfoam.org (default: the one installed, else com)"
+    group.add_argument("--flavour", choices=("com", "org"), help=text)
     layers = Option("layers", "prism layers along the wall", whole, Limits(low=0), "2", "N")
     options.add_option(group, layers, default=2)
     foam.set_defaults(command=_openfoam)
-    patches = options.add_command(
-        kinds,
-        "patches",
-        "Write the boundary of the lumen as watertight named patches (STL, VTP, JSON; lengths in mm).",
-        "export patches case --out patches",
-    )
+    text = "Write the boundary of the lumen as watertight named patches (STL, VTP, JSON; lengths in mm)."
+    patches = options.add_command(kinds, "patches", text, "export patches case --out patches")
     _add_input(patches)
     options.add_settings(patches, *options.VESSEL)
     patches.set_defaults(command=_patches)

@@ -8,12 +8,8 @@ from vstent.errors import InputError
 
 def add(commands: options.Commands) -> None:
     """Add the command."""
-    parser = options.add_command(
-        commands,
-        "flow",
-        "Compute the blood flow in any vessel, with or without devices.",
-        "flow artery.stl --grid-spacing 0.2 --out case",
-    )
+    text = "Compute the blood flow in any vessel, with or without devices."
+    parser = options.add_command(commands, "flow", text, "flow artery.stl --grid-spacing 0.2 --out case")
     options.add_case(parser)
     text = "compare the flow without a device on three grids, with three time steps and in three orientations"
     options.add_flag(parser, "convergence", text)

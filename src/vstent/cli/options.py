@@ -104,19 +104,12 @@ def add_command(commands: Commands, name: str, text: str, example: str) -> argpa
 
 def add_case(parser: argparse.ArgumentParser) -> None:
     """Add input and case folder."""
-    parser.add_argument(
-        "input",
-        type=Path,
-        help="scan (DICOM folder, NIfTI, NRRD, MHA, VTI, raw) or surface (STL, VTP, VTU, VTK, OBJ, PLY)",
-    )
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="case folder; a folder that exists is continued"
-    )
-    add_flag(
-        parser,
-        "replace",
-        "replace results in the case folder that belong to another input or other settings (default: refuse)",
-    )
+    text = "scan (DICOM folder, NIfTI, NRRD, MHA, VTI, raw) or surface (STL, VTP, VTU, VTK, OBJ, PLY)"
+    parser.add_argument("input", type=Path, help=text)
+    text = "case folder; a folder that exists is continued"
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=text)
+    text = "replace results in the case folder that belong to another input or other settings (default: refuse)"
+    add_flag(parser, "replace", text)
 
 
 def add_workers(group: "argparse._ArgumentGroup") -> None:

@@ -13,12 +13,8 @@ SHOWN: Final = 15
 
 def add(commands: options.Commands) -> None:
     """Add the command."""
-    parser = options.add_command(
-        commands,
-        "rank",
-        "Deploy every size of the chosen devices, measure them and rank them.",
-        "rank artery.stl --device silk --device pipeline --out case",
-    )
+    text = "Deploy every size of the chosen devices, measure them and rank them."
+    parser = options.add_command(commands, "rank", text, "rank artery.stl --device silk --device pipeline --out case")
     options.add_case(parser)
     of_treatments = ("treatment", "diameter", "length", "center")
     options.add_settings(parser, *options.VESSEL, "treatments", "flow", without=("no-flow", *of_treatments))

@@ -23,12 +23,8 @@ PDF: Final = "also write the report as report.pdf"
 
 def add(commands: options.Commands) -> None:
     """Add the command."""
-    parser = options.add_command(
-        commands,
-        "run",
-        "Deploy stents in a patient's artery, compute the flow before and after, and write a report.",
-        "run scan/ --device silk --device enterprise --out case",
-    )
+    text = "Deploy stents in a patient's artery, compute the flow before and after, and write a report."
+    parser = options.add_command(commands, "run", text, "run scan/ --device silk --device enterprise --out case")
     options.add_case(parser)
     options.add_settings(parser, *options.VESSEL, *options.STUDY)
     options.add_flag(parser, "angiogram", "also carry contrast through the flows and film it")
@@ -36,23 +32,22 @@ def add(commands: options.Commands) -> None:
     options.add_flag(parser, "pdf", PDF)
     options.add_flag(parser, "plan", "write the plan of every device on one page, plan.pdf, without the flow")
     options.add_flag(parser, "ro-crate", "also describe the case folder as an RO-Crate")
-    parser.add_argument(
-        "--input", dest="moved_to", type=Path, metavar="PATH", help="present place of the input of a run.json to repeat"
-    )
+    text = "present place of the input of a run.json to repeat"
+    parser.add_argument("--input", dest="moved_to", type=Path, metavar="PATH", help=text)
     parser.set_defaults(command=_run, answered=finished.answered)
 
 
 def study(
     path: Path,
-    out: Path,
     settings: "Settings",
     console: "Console",
-    *,
-    is_printed: bool,
-    replaces: bool,
+    arguments: argparse.Namespace,
     injected: "AngiogramSettings | None" = None,
 ) -> "CaseResult":
-    """Run a study, show its progress, write its reports and print its tables; angiograms too where `injected`."""
+    """Run a study, show its progress, write its reports and print its tables; angiograms too where `injected`.
+
+    The arguments state the case folder, and whether results are replaced and the report is printed.
+    """
     from vstent.angiography.filming import FilmSettings
     from vstent.cli.console import angiogram_table, comparison_table, device_sentences, uncertainty_table
     from vstent.reporting.drawing import Drawing
@@ -62,18 +57,20 @@ def study(
     from vstent.study.pipeline import run
     from vstent.study.progress import Progress
 
+    out = arguments.out
+
     def told(now: Progress) -> None:
         console.progress(now)
         if now.computed is not None:  # the pictures are drawn while the measures are computed
             drawing.begin(now.computed)
 
     with console.live(), Drawing() as drawing:
-        case = run(path, out, settings, told, replaces=replaces)
+        case = run(path, out, settings, told, replaces=arguments.replace)
         if injected is not None:
             angiograms = film_case(out, injected, FilmSettings(), console.progress)
             add_measures(case.metrics, {name: one.measures for name, one in angiograms.items()})
         console.progress(Progress("report", 0.0))
-        write_report(case, out, is_printed=is_printed, drawing=drawing)
+        write_report(case, out, is_printed=arguments.pdf, drawing=drawing)
         console.progress(Progress("report", 1.0, str(out / "report.html")))
     console.print(comparison_table(case.metrics))
     for sentence in device_sentences(case.metrics):
@@ -108,8 +105,7 @@ def _run(arguments: argparse.Namespace) -> int:
             console.say(f"Changed since: {difference}.")
         path, settings = record.input, record.settings
     before = finished.begun(arguments, path)
-    asked = {"is_printed": arguments.pdf, "replaces": arguments.replace, "injected": injected}
-    case = study(path, out, settings, console, **asked)
+    case = study(path, settings, console, arguments, injected)
     if arguments.plan:
         write_plan(case, out, date.today().isoformat())
     if arguments.ro_crate:

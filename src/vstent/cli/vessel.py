@@ -7,15 +7,13 @@ from vstent.cli import options
 
 def add(commands: options.Commands) -> None:
     """Add the commands."""
-    tracing = options.add_command(
-        commands, "trace", "Find the vessel wall, its openings and its centerlines.", "trace artery.stl --out case"
-    )
+    text = "Find the vessel wall, its openings and its centerlines."
+    tracing = options.add_command(commands, "trace", text, "trace artery.stl --out case")
     options.add_case(tracing)
     options.add_settings(tracing, *options.VESSEL, without=("outlet", "neck", "upstream", "downstream"))
     tracing.set_defaults(command=_trace)
-    restoring = options.add_command(
-        commands, "restore", "Remove the sac, restore the parent artery, and measure both.", "restore scan/ --out case"
-    )
+    text = "Remove the sac, restore the parent artery, and measure both."
+    restoring = options.add_command(commands, "restore", text, "restore scan/ --out case")
     options.add_case(restoring)
     options.add_settings(restoring, *options.VESSEL)
     restoring.set_defaults(command=_restore)

@@ -23,6 +23,7 @@ from vstent.reporting.figures import patient_picture
 from vstent.study.folder import CACHE
 from vstent.study.pipeline import restore_vessel, run
 from vstent.study.progress import OnProgress, Progress
+from vstent.study.repeat import flat
 from vstent.study.settings import Settings
 from vstent.study.store import Key, Store
 from vstent.study.workers import AbstractWorkers, alone
@@ -91,10 +92,10 @@ def run_cohort(tasks: Sequence[Task], out: Path, workers: AbstractWorkers, progr
     VstentError
         The connection to the cluster is lost; finished rows are kept.
     """
-    for done, ended in enumerate(workers.do(work, tasks), start=1):
-        task = tasks[ended.number]
+    for done, (number, fault) in enumerate(workers.do(work, tasks), start=1):
+        task = tasks[number]
         for treatment in task.keys.keys() - read_rows(task.folder, task.keys).keys():
-            _write_row(task, treatment, {"outcome": LOST, "stage": "", "sentence": ended.fault})
+            _write_row(task, treatment, {"outcome": LOST, "stage": "", "sentence": fault})
         progress(done, len(tasks), task.case.name, collect([task.case], out))
 
 
@@ -188,15 +189,7 @@ def flat_metrics(metrics: Mapping[str, Any], treatment: str) -> Row:
     implants = found.pop("implants")
     parts = {"vessel": metrics["vessel"], BARE: metrics["treatments"].get(BARE, {}).get("flow", {})}
     alone = {"implant": next(iter(implants.values()))} if len(implants) == 1 else {"implants": implants}
-    return _flat(parts | alone | found, "")
-
-
-def _flat(values: Mapping[str, Any], before: str) -> Row:
-    """Return nested values under dotted keys."""
-    row: Row = {}
-    for name, value in values.items():
-        row |= _flat(value, f"{before}{name}.") if isinstance(value, Mapping) else {f"{before}{name}": value}
-    return row
+    return flat(parts | alone | found)
 
 
 def _write_row(task: Task, treatment: str, row: Row) -> None:

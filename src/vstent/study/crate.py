@@ -74,48 +74,43 @@ def write_crate(folder: Path, provenance: Mapping[str, Any], when: str) -> None:
         with path.open("rb") as stream:
             digest = hashlib.file_digest(stream, "sha256")
         files.append(
-            {
-                "@id": place.as_posix(),
-                "@type": "File",
-                "name": ABOUT.get(path.name, path.name),
-                "encodingFormat": FORMATS.get(path.suffix, "application/octet-stream"),
-                "contentSize": str(path.stat().st_size),
-                "sha256": digest.hexdigest(),
-            }
+            _entity(
+                place.as_posix(),
+                "File",
+                name=ABOUT.get(path.name, path.name),
+                encodingFormat=FORMATS.get(path.suffix, "application/octet-stream"),
+                contentSize=str(path.stat().st_size),
+                sha256=digest.hexdigest(),
+            )
         )
-    description = {
-        "@id": NAME,
-        "@type": "CreativeWork",
-        "conformsTo": {"@id": "https://w3id.org/ro/crate/1.1"},
-        "about": {"@id": "./"},
-    }
-    case = {
-        "@id": "./",
-        "@type": "Dataset",
-        "name": f"Virtual stenting of {folder.resolve().name}",
-        "description": "A virtual stenting by vstent. Research use only: not for diagnosis or treatment.",
-        "datePublished": when,
-        "license": "Not for publication unless the holder of the rights in the scan agrees",
-        "hasPart": [{"@id": file["@id"]} for file in files],
-        "mentions": {"@id": "#run"},
-    }
-    program = {
-        "@id": "#vstent",
-        "@type": "SoftwareApplication",
-        "name": "vstent",
-        "version": provenance["versions"]["vstent"],
-        "license": {"@id": LICENSE},
-    }
-    run = {
-        "@id": "#run",
-        "@type": "CreateAction",
-        "name": "vstent run",
-        "endTime": when,
-        "instrument": {"@id": "#vstent"},
-        "object": {"@id": "#input"},
-        "result": case["hasPart"],
-    }
-    license_ = {"@id": LICENSE, "@type": "CreativeWork", "name": "BSD 3-Clause"}
-    given = {"@id": "#input", "@type": "CreativeWork"} | {key: provenance["input"][key] for key in ("name", "sha256")}
-    graph = [description, case, *files, program, license_, given, run]
+    given, version = provenance["input"], provenance["versions"]["vstent"]
+    parts, links = [_link(file["@id"]) for file in files], {"instrument": _link("#vstent"), "object": _link("#input")}
+    graph = [
+        _entity(NAME, "CreativeWork", conformsTo=_link("https://w3id.org/ro/crate/1.1"), about=_link("./")),
+        _entity(
+            "./",
+            "Dataset",
+            name=f"Virtual stenting of {folder.resolve().name}",
+            description="A virtual stenting by vstent. Research use only: not for diagnosis or treatment.",
+            datePublished=when,
+            license="Not for publication unless the holder of the rights in the scan agrees",
+            hasPart=parts,
+            mentions=_link("#run"),
+        ),
+        *files,
+        _entity("#vstent", "SoftwareApplication", name="vstent", version=version, license=_link(LICENSE)),
+        _entity(LICENSE, "CreativeWork", name="BSD 3-Clause"),
+        _entity("#input", "CreativeWork", name=given["name"], sha256=given["sha256"]),
+        _entity("#run", "CreateAction", name="vstent run", endTime=when, **links, result=parts),
+    ]
     write_json(folder / NAME, {"@context": "https://w3id.org/ro/crate/1.1/context", "@graph": graph})
+
+
+def _entity(id_: str, kind: str, **more: Any) -> dict[str, Any]:
+    """Return an entity of the description."""
+    return {"@id": id_, "@type": kind} | more
+
+
+def _link(id_: str) -> dict[str, str]:
+    """Return a link to an entity."""
+    return {"@id": id_}

@@ -3,11 +3,10 @@
 import json
 import os
 import platform
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from functools import wraps
 from pathlib import Path
-from typing import IO, Concatenate, Final, ParamSpec, TypeVar
+from typing import IO, Final
 
 from vstent.errors import FolderError, ReadError
 from vstent.io.files import sweep
@@ -28,22 +27,6 @@ LOCK: Final = "lock"
 
 TREATMENTS: Final = "treatments"
 """Subfolder of the case folder with a folder for every treatment."""
-
-Given = ParamSpec("Given")
-Result = TypeVar("Result")
-
-
-def claiming(
-    study: Callable[Concatenate[Path, Path, Given], Result],
-) -> Callable[Concatenate[Path | str, Path | str, Given], Result]:
-    """Decorate a study so that it reserves its case folder (the second argument) while it runs (`claimed`)."""
-
-    @wraps(study)
-    def alone(path: Path | str, out: Path | str, /, *args: Given.args, **given: Given.kwargs) -> Result:
-        with claimed(Path(out)):
-            return study(Path(path), Path(out), *args, **given)
-
-    return alone
 
 
 def implant_folder(out: Path, treatment: str, implant: str) -> Path:

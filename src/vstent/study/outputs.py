@@ -26,17 +26,12 @@ from vstent.study.store import UNREADABLE
 
 IMPLANT: Final = ("contour.vtp", "wires.vtp", "struts.stl", "struts.3mf")
 """Files of one implant."""
-FIELD: Final = ("field.vtu", "wall.vtp")
-"""Files of one flow."""
-ANGIOGRAM: Final = ("angiogram/*.*", "angiogram/*/frame_*.png")
-"""Files of the angiogram, as patterns."""
 SACS: Final = ("sac.vtp", "sac_[0-9].vtp", "neck.vtp", "neck_[0-9].vtp")
 """Files of sacs and necks, as patterns."""
 OF_STUDY: Final = (
     *(METRICS, RUN, "report.html", "report.pdf", "plan.pdf", CRATE),
     *(f"treatments/*/implants/*/{name}" for name in IMPLANT),
-    *(f"treatments/*/flow/{name}" for name in FIELD),
-    *ANGIOGRAM,
+    *("treatments/*/flow/field.vtu", "treatments/*/flow/wall.vtp", "angiogram/*.*", "angiogram/*/frame_*.png"),
 )
 """Files of devices, flows and reports, as patterns."""
 FOLDERS: Final = (

@@ -5,14 +5,14 @@ no files. After that each finished stage is stored in the folder under a key of 
 same study reads it instead of computing it.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from vstent.anatomy.morphology import morphology
-from vstent.devices.stent import Deployment
 from vstent.devices.treatment import BARE
 from vstent.flow.case import FlowField
 from vstent.flow.convergence import Sensitivity, convergence
@@ -24,11 +24,10 @@ from vstent.io import writers
 from vstent.study import outputs, stages
 from vstent.study.contrast import add_measures, stored_measures
 from vstent.study.crate import NAME as CRATE
-from vstent.study.folder import CACHE, INPUT, LAYOUT, METRICS, RUN, TREATMENTS, claiming, implant_folder
-from vstent.study.former import merged, note_begun, refuse_other_anatomy, refuse_other_input
+from vstent.study.folder import CACHE, INPUT, LAYOUT, METRICS, RUN, TREATMENTS, claimed, implant_folder
 from vstent.study.keys import ANATOMY, VESSEL, anatomy_keys, hash_of, key_of, measures_key, stage_name, study_keys
 from vstent.study.progress import OnProgress, Progress
-from vstent.study.repeat import SECONDS, former_source, is_of_another, provenance
+from vstent.study.repeat import SECONDS, former_source, is_of_another, merged, note_begun, provenance, refuse_other
 from vstent.study.settings import Settings
 from vstent.study.store import Key, Store, silent
 
@@ -39,7 +38,7 @@ class Computed:
 
     anatomy: Anatomy
     """Vessel, sacs and paths."""
-    implants: Mapping[str, Mapping[str, Deployment]]
+    implants: stages.Implants
     """Deployed implants by treatment and id."""
     fields: Mapping[str, FlowField]
     """Flows by treatment, ``bare`` first; empty where no flow was requested."""
@@ -65,10 +64,9 @@ class CaseResult(Computed):
     """Keys of the stages by name."""
 
 
-@claiming
 def run(
-    path: Path,
-    out: Path,
+    path: Path | str,
+    out: Path | str,
     settings: Settings,
     progress: OnProgress = silent,
     *,
@@ -103,69 +101,67 @@ def run(
         Another process uses the folder, or it cannot be written.
     """
     check_engine(settings.flow)
-    store = Store(out / CACHE, progress)
-    source = hash_of(path)
-    if not replaces:
-        settings = merged(out, source, settings)
-    keys = study_keys(source, settings)
-    store.foretell(keys)
-    anatomy = stages.find_anatomy(path, settings, store, keys)
-    stages.check_inflow(anatomy, settings.flow)
-    implants, failures = stages.deploy_all(anatomy, settings, store, keys)
-    record = provenance(path, source, settings)
-    has_former = replaces and is_of_another(out, record)
-    named = [treatment.name for treatment in settings.treatments]
-    _save_deferred(path, out, source, store, named, is_replaced=has_former)
-    note_begun(out, settings)
-    if has_former:
-        outputs.take_away_study(out, stages.engine_folders(out, settings).values())
-    (out / CRATE).unlink(missing_ok=True)  # it describes files that this run replaces
-    outputs.write_anatomy(out, anatomy)
-    for treatment in settings.treatments:
-        for implant in treatment.implants if treatment.name in implants else ():
-            folder, name = implant_folder(out, treatment.name, implant.id), stage_name(treatment, implant)
-            key = key_of("vstent.study.outputs:write_implant", keys[f"deploy {name}"])
-            write = partial(outputs.write_implant, folder, implants[treatment.name][implant.id])
-            store.write_once(f"struts {name}", key, folder, outputs.IMPLANT, write)
-    fields, unflown = stages.compute_flows(out, anatomy, implants, settings, store, keys)
-    failures |= unflown
-    varied = stages.vary_all(anatomy, implants, settings, store, keys)
-    computed = Computed(anatomy, implants, fields, store.load(VESSEL, keys[VESSEL], Vessel))
+    path, out = Path(path), Path(out)
+    with _begun(path, out, settings, progress, replaces) as (store, source):
+        if not replaces:
+            settings = merged(out, settings)
+        keys = study_keys(source, settings)
+        store.foretell(keys)
+        anatomy = stages.find_anatomy(path, settings, store, keys)
+        stages.check_inflow(anatomy, settings.flow)
+        implants, failures = stages.deploy_all(anatomy, settings, store, keys)
+        record = provenance(path, source, settings)
+        has_former = replaces and is_of_another(out, record)
+        named = [treatment.name for treatment in settings.treatments]
+        _save_deferred(path, out, source, store, named, is_replaced=has_former)
+        note_begun(out, settings)
+        if has_former:
+            outputs.take_away_study(out, stages.engine_folders(out, settings).values())
+        (out / CRATE).unlink(missing_ok=True)  # it describes files that this run replaces
+        outputs.write_anatomy(out, anatomy)
+        for treatment in settings.treatments:
+            for implant in treatment.implants if treatment.name in implants else ():
+                folder, name = implant_folder(out, treatment.name, implant.id), stage_name(treatment, implant)
+                key = key_of("vstent.study.outputs:write_implant", keys[f"deploy {name}"])
+                write = partial(outputs.write_implant, folder, implants[treatment.name][implant.id])
+                store.write_once(f"struts {name}", key, folder, outputs.IMPLANT, write)
+        fields, unflown = stages.compute_flows(out, anatomy, implants, settings, store, keys)
+        failures |= unflown
+        varied = stages.vary_all(anatomy, implants, settings, store, keys)
+        computed = Computed(anatomy, implants, fields, store.load(VESSEL, keys[VESSEL], Vessel))
 
-    def measures() -> dict[str, Any]:
-        progress(Progress("measure", 0.0, computed=computed))
-        return stages.measure_study(anatomy, implants, fields, settings, varied, failures)
+        def measures() -> dict[str, Any]:
+            progress(Progress("measure", 0.0, computed=computed))
+            return stages.measure_study(anatomy, implants, fields, settings, varied, failures)
 
-    metrics = store.compute_once("measure", measures_key(settings, keys, failures), measures)
-    add_measures(metrics, stored_measures(out, keys) if fields else {})
-    writers.write_json(out / METRICS, metrics)
-    record[SECONDS] = store.seconds
-    writers.write_json(out / RUN, record, is_exact=True)
-    of_flows = (f"Flow, {name}: {field.advice}" for name, field in fields.items())
-    of_failures = (f"{name}: {sentence}" for name, sentence in failures.items())
-    notes = (*of_failures, *anatomy.vessel.notes, *anatomy.notes, *of_flows, *stages.neck_notes(metrics))
-    return CaseResult(
-        **vars(computed),
-        name=out.resolve().name,
-        metrics=metrics,
-        provenance=record,
-        failures=failures,
-        notes=notes,
-        keys=keys,
-    )
+        metrics = store.compute_once("measure", measures_key(settings, keys, failures), measures)
+        add_measures(metrics, stored_measures(out, keys) if fields else {})
+        writers.write_json(out / METRICS, metrics)
+        record[SECONDS] = store.seconds
+        writers.write_json(out / RUN, record, is_exact=True)
+        of_flows = (f"Flow, {name}: {field.advice}" for name, field in fields.items())
+        of_failures = (f"{name}: {sentence}" for name, sentence in failures.items())
+        notes = (*of_failures, *anatomy.vessel.notes, *anatomy.notes, *of_flows, *stages.neck_notes(metrics))
+        return CaseResult(
+            **vars(computed),
+            name=out.resolve().name,
+            metrics=metrics,
+            provenance=record,
+            failures=failures,
+            notes=notes,
+            keys=keys,
+        )
 
 
-@claiming
 def trace_vessel(path: Path, out: Path, settings: Settings, progress: OnProgress, *, replaces: bool = False) -> Vessel:
     """Find the vessel, its openings and its centerlines, untrimmed, and write them; all else as in `run`."""
-    store, source = _begun(path, out, settings, progress, replaces)
-    vessel = stages.find_vessel(path, settings, store, anatomy_keys(source, settings))
-    _save_deferred(path, out, source, store)
-    outputs.write_vessel(out, vessel)
-    return vessel
+    with _begun(path, out, settings, progress, replaces) as (store, source):
+        vessel = stages.find_vessel(path, settings, store, anatomy_keys(source, settings))
+        _save_deferred(path, out, source, store)
+        outputs.write_vessel(out, vessel)
+        return vessel
 
 
-@claiming
 def restore_vessel(
     path: Path, out: Path, settings: Settings, progress: OnProgress, *, replaces: bool = False
 ) -> tuple[Anatomy, dict[str, Any]]:
@@ -173,16 +169,15 @@ def restore_vessel(
 
     A study in the same folder reuses the result, and the other way round. Errors and `replaces` are as in `run`.
     """
-    store, source = _begun(path, out, settings, progress, replaces)
-    anatomy = stages.find_anatomy(path, settings, store, anatomy_keys(source, settings))
-    measures = morphology(anatomy)
-    _save_deferred(path, out, source, store)
-    outputs.write_anatomy(out, anatomy)
-    writers.write_json(out / "morphology.json", measures)
-    return anatomy, measures
+    with _begun(path, out, settings, progress, replaces) as (store, source):
+        anatomy = stages.find_anatomy(path, settings, store, anatomy_keys(source, settings))
+        measures = morphology(anatomy)
+        _save_deferred(path, out, source, store)
+        outputs.write_anatomy(out, anatomy)
+        writers.write_json(out / "morphology.json", measures)
+        return anatomy, measures
 
 
-@claiming
 def refine_flow(
     path: Path, out: Path, settings: Settings, progress: OnProgress, *, replaces: bool = False
 ) -> Sensitivity:
@@ -191,35 +186,38 @@ def refine_flow(
     The grid spacing of the settings, given or proposed, is the finest. Errors and `replaces` are as in `run`.
     """
     check_engine(settings.flow)
-    store, source = _begun(path, out, settings, progress, replaces)
-    anatomy = stages.find_anatomy(path, settings, store, anatomy_keys(source, settings))
-    stages.check_inflow(anatomy, settings.flow)
-    _save_deferred(path, out, source, store)
-    flow = settings.flow or FlowSettings()
-    stages.plan_flows(anatomy, {BARE: ()}, flow, store)
-    with store.stage("convergence") as tell:
-        sentences: list[str] = []
+    with _begun(path, out, settings, progress, replaces) as (store, source):
+        anatomy = stages.find_anatomy(path, settings, store, anatomy_keys(source, settings))
+        stages.check_inflow(anatomy, settings.flow)
+        _save_deferred(path, out, source, store)
+        flow = settings.flow or FlowSettings()
+        stages.plan_flows(anatomy, {BARE: ()}, flow, store)
+        with store.stage("convergence") as tell:
+            sentences: list[str] = []
 
-        def told(fraction: float, sentence: str) -> None:
-            sentences.append(sentence)
-            store.progress("convergence", 0.99 * fraction, sentence)
+            def told(fraction: float, sentence: str) -> None:
+                sentences.append(sentence)
+                store.progress("convergence", 0.99 * fraction, sentence)
 
-        folder = out / "convergence" / flow.numerics.engine
-        sensitivity = convergence(flow_case(anatomy, (), flow), folder=folder, told=told)
-        tell(" ".join(sentences))
-    refinements = {one.name: asdict(one) for one in sensitivity.refinements}
-    refinements["grid_position"] = {key: asdict(one) for key, one in sensitivity.positions.items()}
-    writers.write_json(out / "convergence.json", refinements)
-    return sensitivity
+            folder = out / "convergence" / flow.numerics.engine
+            sensitivity = convergence(flow_case(anatomy, (), flow), folder=folder, told=told)
+            tell(" ".join(sentences))
+        refinements = {one.name: asdict(one) for one in sensitivity.refinements}
+        refinements["grid_position"] = {key: asdict(one) for key, one in sensitivity.positions.items()}
+        writers.write_json(out / "convergence.json", refinements)
+        return sensitivity
 
 
-def _begun(path: Path, out: Path, settings: Settings, progress: OnProgress, replaces: bool) -> tuple[Store, str]:
-    """Return the store of a case folder and the SHA-256 of an input; results of another one are refused or replaced."""
-    source = hash_of(path)
-    if not replaces:
-        refuse_other_input(out, source)
-        refuse_other_anatomy(out, settings)
-    return Store(out / CACHE, progress), source
+@contextmanager
+def _begun(
+    path: Path, out: Path, settings: Settings, progress: OnProgress, replaces: bool
+) -> Iterator[tuple[Store, str]]:
+    """Reserve a case folder; yield its store and the SHA-256 of an input. Results of another one may be refused."""
+    with claimed(out):
+        source = hash_of(path)
+        if not replaces:
+            refuse_other(out, source, settings)
+        yield Store(out / CACHE, progress), source
 
 
 def _save_deferred(

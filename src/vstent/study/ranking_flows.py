@@ -2,13 +2,12 @@
 
 import pickle
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from vstent.devices.treatment import BARE
-from vstent.flow.case import FlowField
 from vstent.flow.memory import free_memory_bytes
 from vstent.flow.problem import flow_case
 from vstent.flow.settings import FlowSettings
@@ -63,30 +62,11 @@ class FlowStore:
         return name, key_of("vstent.plan.rank_flow", self._anatomy, self._settings, device)
 
 
-@dataclass(frozen=True, eq=False)
-class Common:
-    """What all flows of a ranking need."""
-
-    anatomy: Anatomy
-    """The restored artery."""
-    settings: FlowSettings
-    """Settings of the flows."""
-    candidates: tuple[Candidate, ...]
-    """Candidates whose flow is missing."""
-    bare: FlowField
-    """The flow without a device."""
-    has_contrast: bool
-    """Whether the retention of contrast is measured."""
-    threads: int
-    """Number of threads of each flow."""
-
-
-@dataclass(frozen=True)
-class FlowTask:
+class FlowTask(NamedTuple):
     """The flow with one candidate."""
 
     folder: Path
-    """Folder that all workers reach, with the common data and the finished flows."""
+    """Folder that all workers reach, with what all flows need and the finished flows."""
     number: int
     """Index of the candidate."""
 
@@ -129,32 +109,27 @@ def compute_missing(
     progress(before, total, f"{len(wanted)} devices in parallel")
     with TemporaryDirectory(prefix="rank-flow-", dir=stored.folder) as name:
         folder = Path(name)
-        write_pickle(folder / COMMON, Common(anatomy, settings, wanted, bare, has_contrast, threads))
+        write_pickle(folder / COMMON, (anatomy, settings, wanted, bare, has_contrast, threads))
         tasks = [FlowTask(folder, number) for number in range(len(wanted))]
-        for done, ended in enumerate(workers.do(work, tasks), start=1):
-            candidate = wanted[ended.number]
-            if ended.fault:
-                stored.lose(candidate, ended.fault)
+        for done, (number, fault) in enumerate(workers.do(work, tasks), start=1):
+            candidate = wanted[number]
+            if fault:
+                stored.lose(candidate, fault)
             else:
-                stored[candidate] = _read_pickle(folder / f"{ended.number}{RESULT}")
+                stored[candidate] = _read_pickle(folder / f"{number}{RESULT}")
             progress(before + done, total, candidate.label)
 
 
 def work(task: FlowTask) -> None:
     """Compute the flow with one candidate, and write it and its result into the folder of the task."""
-    common: Common = _read_pickle(task.folder / COMMON)
-    with alone(common.threads):
-        candidate = common.candidates[task.number]
-        paths = ((coverage_of(one), task.folder / f"{n}{FIELD}") for n, one in enumerate(common.candidates))
-        similar = nearest(coverage_of(candidate), [one for one in paths if one[1].exists()])
-        field, measured = flow_with(
-            common.anatomy,
-            candidate,
-            common.settings,
-            start=common.bare,
-            similar=None if similar is None else _read_pickle(similar),
-            has_contrast=common.has_contrast,
-        )
+    anatomy, settings, candidates, bare, has_contrast, threads = _read_pickle(task.folder / COMMON)
+    with alone(threads):
+        candidate = candidates[task.number]
+        paths = ((coverage_of(one), task.folder / f"{n}{FIELD}") for n, one in enumerate(candidates))
+        path = nearest(coverage_of(candidate), [one for one in paths if one[1].exists()])
+        similar = None if path is None else _read_pickle(path)
+        starts = {"start": bare, "similar": similar, "has_contrast": has_contrast}
+        field, measured = flow_with(anatomy, candidate, settings, **starts)
         if field is not None:
             write_pickle(task.folder / f"{task.number}{FIELD}", field)
         write_pickle(task.folder / f"{task.number}{RESULT}", measured())

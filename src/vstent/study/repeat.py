@@ -1,10 +1,14 @@
-"""Record of a run in its `run.json`: everything needed to repeat it. Repeat a run, and compare the results."""
+"""Records of runs in `run.json`: repeat a run, compare the results, and merge a run with the last one of its folder.
+
+Computed results are kept: a run with another device adds it. A change of the input or of a setting that would
+invalidate results is refused, unless the user asks to replace them.
+"""
 
 import json
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -12,9 +16,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 from vstent.devices.catalogue import find_design
 from vstent.errors import InputError, ReadError
+from vstent.fields import differing
 from vstent.flow.lattice.gpu import gpu_name
 from vstent.io.files import existing
-from vstent.study.folder import CACHE, INPUT, LAYOUT, METRICS, RUN
+from vstent.io.writers import write_json
+from vstent.study.folder import CACHE, INPUT, LAYOUT, METRICS, RUN, TREATMENTS
 from vstent.study.keys import hash_of
 from vstent.study.settings import Settings
 from vstent.study.store import UNREADABLE, digest
@@ -22,6 +28,8 @@ from vstent.study.store import UNREADABLE, digest
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
 
+BEGUN: Final = "settings.json"
+"""File in the cache folder with the settings of the last run that was started, finished or not."""
 PACKAGES: Final = ("vstent", "numpy", "scipy", "numba", "vtk", "SimpleITK", "pydicom")
 """Packages whose versions are recorded."""
 MISSING: Final = "absent"
@@ -180,7 +188,7 @@ def agreement(first: Path, second: Path) -> str:
         raise ReadError(f"{error.filename} cannot be read, so there is nothing to compare with") from None
     if one == other:
         return "The metrics are identical to the last bit."
-    then, now = dict(_numbers(json.loads(one))), dict(_numbers(json.loads(other)))
+    then, now = flat(json.loads(one)), flat(json.loads(other))
     if set(then) != set(now):
         return f"The metrics differ: {len(set(then) ^ set(now))} of them exist in one run only."
     apart = {name: _relative(then[name], now[name]) for name in then}
@@ -205,10 +213,79 @@ def _relative(one: Any, other: Any) -> float:
     return 0.0 if apart < ROUNDING else float(apart / max(abs(one), abs(other)))
 
 
-def _numbers(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield all values of nested metrics with dotted names."""
+def flat(values: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+    """Return all values of nested metrics under dotted names."""
+    found: dict[str, Any] = {}
     for name, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _numbers(value, f"{before}{name}.")
-        else:
-            yield f"{before}{name}", value
+        found |= flat(value, f"{before}{name}.") if isinstance(value, Mapping) else {f"{before}{name}": value}
+    return found
+
+
+def former_settings(out: Path) -> Settings | None:
+    """Return the settings of the last run of a case folder; None where there is none, or they cannot be read."""
+    for path in (out / CACHE / BEGUN, out / RUN):
+        with suppress(*UNREADABLE):
+            told = json.loads(path.read_text(encoding="utf-8"))
+            return settings_of(told["settings"])
+    return None
+
+
+def note_begun(out: Path, settings: Settings) -> None:
+    """Store the settings of a run that starts to write into a case folder."""
+    write_json(out / CACHE / BEGUN, {"settings": asdict(settings)}, is_exact=True)
+
+
+def merged(out: Path, settings: Settings) -> Settings:
+    """Return the settings of a run merged with those of the folder's last run of the same input (`refuse_other`).
+
+    Earlier treatments come first and keep their sizes, places and flows; new ones are added. Where a run requests no
+    flow, new treatments get none and existing flows are kept.
+
+    Raises
+    ------
+    InputError
+        The folder holds results of settings that the new ones would invalidate.
+    """
+    former = former_settings(out)
+    if former is None:
+        return settings
+    before, now = ({one.name: one for one in run.treatments} for run in (former, settings))
+    treatments = []
+    for name in {**before, **now}:
+        old, new = before.get(name), now.get(name)
+        if new and not (out / TREATMENTS / name).exists():  # the old one failed, or was not reached
+            old = None
+        runs = ((old, former.flow), (new, settings.flow))
+        has_flow = any(one is not None and one.has_flow and flow is not None for one, flow in runs)
+        if old and new and new.is_proposed and old.devices == new.devices:
+            new = None  # it leaves sizes and places to the old one
+        given = (one and replace(one, has_flow=has_flow) for one in (old, new))
+        treatments.append(_same(out, f"sizes or places of {name}", *given))
+    flow = _same(out, "flow settings", former.flow, settings.flow)
+    return replace(
+        former,
+        treatments=tuple(treatments if flow else (replace(one, has_flow=True) for one in treatments)),
+        flow=flow,
+        uncertainty=_same(out, "ranges of uncertainty", former.uncertainty, settings.uncertainty),
+    )
+
+
+def refuse_other(out: Path, source: str, settings: Settings) -> None:
+    """Raise InputError where a case folder holds results of an input with another SHA-256, or of another anatomy."""
+    former = former_settings(out)
+    if former_source(out) not in (source, None):
+        raise InputError(f"{out} holds the results of another input. Give another --out, or --replace to replace them.")
+    if former is not None:
+        changed = [*differing(former.input, settings.input), *differing(former.anatomy, settings.anatomy)]
+        if changed:
+            what = ", ".join(changed)
+            raise InputError(
+                f"{out} holds results with another {what}. Give another --out, or --replace to replace them."
+            )
+
+
+def _same(out: Path, what: str, former: Any, given: Any) -> Any:
+    """Return a setting that at least one of two runs states; raise InputError where both do and differ."""
+    if former is not None and given is not None and former != given:
+        raise InputError(f"{out} holds results with other {what}. Give another --out, or --replace to replace them.")
+    return given if former is None else former

@@ -33,7 +33,7 @@ from vstent.flow.indices import indices, ratios
 from vstent.flow.ostium import ostium, surfaces_beside
 from vstent.flow.problem import flow_case, vessel_case
 from vstent.flow.settings import FlowSettings
-from vstent.flow.simulation import OnProgress, foretell_cost, simulate_case
+from vstent.flow.simulation import foretell_cost, simulate_case
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.files import is_surface_file
 from vstent.io.images import read_image
@@ -44,8 +44,13 @@ from vstent.study.folder import flow_folder
 from vstent.study.keys import ANATOMY, VESSEL, stage_name
 from vstent.study.outputs import write_field
 from vstent.study.settings import Point, Settings
-from vstent.study.store import Key, Store, Unfinished
+from vstent.study.store import Key, Store
 from vstent.units import counted
+
+Implants = Mapping[str, Mapping[str, Deployment]]
+"""Deployed implants by treatment and id."""
+Keys = Mapping[str, Key]
+"""Keys of the stages of a study, of `vstent.study.keys`, by name."""
 
 SLOWEST_M_S: Final = 0.01
 """Smallest plausible mean speed at an inlet, in m/s; below it the inflow is taken to be in another unit."""
@@ -56,7 +61,7 @@ NEAR_MM: Final = 3.0
 """Largest distance from the vessel wall, in mm, at which another interpretation of a point is proposed."""
 
 
-def find_anatomy(path: Path, settings: Settings, store: Store, keys: Mapping[str, Key]) -> Anatomy:
+def find_anatomy(path: Path, settings: Settings, store: Store, keys: Keys) -> Anatomy:
     """Return the anatomy of an input, stored or computed; the store writes a new one when `save_deferred` is called.
 
     Where no vessel is found at the point `at_mm`, the error proposes the same point in another frame or as a voxel
@@ -111,7 +116,7 @@ def _readings(path: Path, settings: Settings) -> Iterator[tuple[str, Point]]:
     yield "with the second sign changed", (x, -y, z)
 
 
-def find_vessel(path: Path, settings: Settings, store: Store, keys: Mapping[str, Key]) -> Vessel:
+def find_vessel(path: Path, settings: Settings, store: Store, keys: Keys) -> Vessel:
     """Return the traced vessel of an input, stored or computed; the store writes a new one as in `find_anatomy`."""
     traced = store.find(VESSEL, keys[VESSEL], Vessel)
     if traced is not None:
@@ -136,7 +141,7 @@ def _vessel(path: Path, settings: Settings) -> Vessel:
     return read_vessel(path, **asdict(settings.input), at_mm=at_mm)
 
 
-def finished_anatomy(out: Path, store: Store, keys: Mapping[str, Key]) -> Anatomy:
+def finished_anatomy(out: Path, store: Store, keys: Keys) -> Anatomy:
     """Return the stored anatomy of a finished run of a case folder; ReadError is raised where it is missing."""
     anatomy = store.find(ANATOMY, keys[ANATOMY], Anatomy)
     if anatomy is None:
@@ -145,7 +150,7 @@ def finished_anatomy(out: Path, store: Store, keys: Mapping[str, Key]) -> Anatom
 
 
 def deploy_all(
-    anatomy: Anatomy, settings: Settings, store: Store, keys: Mapping[str, Key]
+    anatomy: Anatomy, settings: Settings, store: Store, keys: Keys
 ) -> tuple[dict[str, dict[str, Deployment]], dict[str, str]]:
     """Return the implants of every treatment, stored or deployed, and the reasons why treatments do not fit, by name.
 
@@ -235,12 +240,7 @@ def engine_folders(out: Path, settings: Settings) -> dict[str, Path]:
 
 
 def compute_flows(
-    out: Path,
-    anatomy: Anatomy,
-    implants: Mapping[str, Mapping[str, Deployment]],
-    settings: Settings,
-    store: Store,
-    keys: Mapping[str, Key],
+    out: Path, anatomy: Anatomy, implants: Implants, settings: Settings, store: Store, keys: Keys
 ) -> tuple[dict[str, FlowField], dict[str, str]]:
     """Return the flow in the bare artery and with every treatment, and the reasons why others failed, by name.
 
@@ -262,16 +262,10 @@ def compute_flows(
                 if name == BARE:
                     plan_flows(anatomy, stents, settings.flow, store)
                 try:
+                    told, unfinished = partial(_tell_flow, store, stage), store.unfinished(stage, keys[stage])
+                    run = {"start": fields.get(BARE), "progress": told, "checkpoint": unfinished}
                     with store.stage(stage) as tell:
-                        field = compute_flow(
-                            anatomy,
-                            stents[name],
-                            settings.flow,
-                            start=fields.get(BARE),
-                            folder=folders[name],
-                            progress=partial(_tell_flow, store, stage),
-                            unfinished=store.unfinished(stage, keys[stage]),
-                        )
+                        field = compute_flow(anatomy, stents[name], settings.flow, folder=folders[name], **run)
                         tell(field.advice)
                 except FlowError as error:
                     if name == BARE:
@@ -293,19 +287,9 @@ def _tell_flow(store: Store, stage: str, now: FlowProgress) -> None:
     store.progress(stage, min(now.fraction, 0.99), "", residual=residual, seconds_left=now.seconds_left)
 
 
-def compute_flow(
-    anatomy: Anatomy,
-    stents: Sequence[Stent],
-    settings: FlowSettings,
-    *,
-    start: FlowField | None,
-    folder: Path,
-    progress: OnProgress,
-    unfinished: Unfinished,
-) -> FlowField:
-    """Compute one flow; an unfinished one resumes."""
-    case = flow_case(anatomy, stents, settings)
-    return simulate_case(case, start=start, folder=folder, progress=progress, checkpoint=unfinished)
+def compute_flow(anatomy: Anatomy, stents: Sequence[Stent], settings: FlowSettings, **how: Any) -> FlowField:
+    """Compute one flow as `simulate_case` does; an unfinished one resumes."""
+    return simulate_case(flow_case(anatomy, stents, settings), **how)
 
 
 def plan_flows(anatomy: Anatomy, stents: Mapping[str, Sequence[Stent]], settings: FlowSettings, store: Store) -> None:
@@ -317,11 +301,7 @@ def plan_flows(anatomy: Anatomy, stents: Mapping[str, Sequence[Stent]], settings
 
 
 def vary_all(
-    anatomy: Anatomy,
-    implants: Mapping[str, Mapping[str, Deployment]],
-    settings: Settings,
-    store: Store,
-    keys: Mapping[str, Key],
+    anatomy: Anatomy, implants: Implants, settings: Settings, store: Store, keys: Keys
 ) -> dict[str, dict[str, Any]]:
     """Return the uncertainties of every treatment with one implant, by name."""
     if settings.uncertainty is None:
@@ -352,7 +332,7 @@ def vary_all(
 
 def measure_study(
     anatomy: Anatomy,
-    implants: Mapping[str, Mapping[str, Deployment]],
+    implants: Implants,
     fields: Mapping[str, FlowField],
     settings: Settings,
     varied: Mapping[str, Any],

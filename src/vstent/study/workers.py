@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
-from typing import Any, Final, NamedTuple, TypeVar, final
+from typing import Any, Final, TypeVar, final
 
 from vstent.children import SAFE, spawning
 from vstent.errors import InputError, VstentError
@@ -40,13 +40,8 @@ def alone(threads: int = 1) -> Iterator[None]:
         yield
 
 
-class Ended(NamedTuple):
-    """A task that has ended."""
-
-    number: int
-    """Index of the task."""
-    fault: str
-    """Reason why its process died; empty where it finished."""
+Ended = tuple[int, str]
+"""Index of a task that has ended, and the reason why its process died; empty where it finished."""
 
 
 class AbstractWorkers(ABC):
@@ -87,9 +82,9 @@ class Processes(AbstractWorkers):
                         waiting.append((number, attempt + 1))
                     elif code:
                         advice = "it may be out of memory. Use fewer jobs and run the same command again."
-                        yield Ended(number, f"Its process {how} {ATTEMPTS} times; {advice}")
+                        yield number, f"Its process {how} {ATTEMPTS} times; {advice}"
                     else:
-                        yield Ended(number, "")
+                        yield number, ""
         finally:
             for process, _, _ in running:
                 process.terminate()
@@ -143,7 +138,7 @@ class DaskCluster(AbstractWorkers):
                     if future.status == "error":
                         advice = "Check the workers' logs and run the same command again."
                         fault = f"Its worker failed: {future.exception()}. {advice}"
-                    yield Ended(futures.pop(future), fault)
+                    yield futures.pop(future), fault
                 time.sleep(0.1)
 
 
