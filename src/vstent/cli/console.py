@@ -160,7 +160,7 @@ def device_sentences(metrics: Mapping[str, Any]) -> list[str]:
     return [
         _spaced(
             " ".join(
-                how_sure(implant, title if len(implants) > 1 else "", is_told=number > 0)
+                how_sure(implant, title if len(implants) > 1 else "", is_repeated=number > 0)
                 for number, (title, implant) in enumerate(implants.items())
             )
         )
