@@ -3,7 +3,8 @@
 Run from the repository: ``python benchmarks/ranges.py [CASE ...]`` (demo C0038). All numbers of a device lie anywhere
 in their ranges in 128 deployments. Every column holds the width of the band over the width of the interval of these
 deployments, and the largest distance of an end from the interval's, over the width; "-" where both have no width. The
-time is the processor time of the bands, without and with the search of the sizes at their ends, and of the bands of gaps.
+time is the processor time of the bands, without and with the search of the sizes at their ends, and of the bands of
+gaps.
 """
 
 import sys

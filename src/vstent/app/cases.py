@@ -74,10 +74,7 @@ class State(BaseModel):
     def former_settings(self) -> Settings:
         """Return the settings that the page cannot change.
 
-        Raises
-        ------
-        ReadError
-            They belong to a study of another version.
+        Raises ReadError: they belong to a study of another version.
         """
         from vstent.study.repeat import settings_of
 
@@ -171,10 +168,7 @@ class Case:
     def input(self) -> Path:
         """Path of the scan or surface.
 
-        Raises
-        ------
-        ReadError
-            There is no input yet.
+        Raises ReadError: there is no input yet.
         """
         if not self._state.input:
             raise ReadError(f"{self._state.name} has no scan yet. Drop one on the page.")
@@ -183,10 +177,7 @@ class Case:
     def change(self, revision: int, choices: Choices) -> State:
         """Replace the choices, based on a revision.
 
-        Raises
-        ------
-        Conflict
-            The case was changed since that revision.
+        Raises Conflict: the case was changed since that revision.
         """
         with self._lock:
             self._check(revision)
@@ -199,10 +190,7 @@ class Case:
     def step_back(self, revision: int, *, forward: bool = False) -> State:
         """Undo the last change, or redo the last undone one.
 
-        Raises
-        ------
-        Conflict
-            The case was changed since that revision, or there is nothing to undo or redo.
+        Raises Conflict: the case was changed since that revision, or there is nothing to undo or redo.
         """
         with self._lock:
             self._check(revision)
@@ -248,12 +236,8 @@ class Case:
 def load(case_id: str, folder: Path) -> Case:
     """Return the case stored in a folder.
 
-    Raises
-    ------
-    ReadError
-        The folder holds no state, or one that cannot be read.
-    InputError
-        It was written by an older version.
+    Raises ReadError: the folder holds no state, or one that cannot be read.
+    Raises InputError: it was written by an older version.
     """
     refuse_older(folder)
     try:
@@ -290,12 +274,8 @@ class Cases:
     def get(self, case_id: str) -> Case:
         """Return a case by its name.
 
-        Raises
-        ------
-        Absent
-            There is no such case.
-        ReadError
-            The case is damaged.
+        Raises Absent: there is no such case.
+        Raises ReadError: the case is damaged.
         """
         with self._lock:
             if case_id not in self._cases:
@@ -331,10 +311,7 @@ class Cases:
     def remove(self, case: Case) -> None:
         """Delete a case of the workspace with its folder.
 
-        Raises
-        ------
-        InputError
-            The folder lies elsewhere, because it was given on the command line.
+        Raises InputError: the folder lies elsewhere, because it was given on the command line.
         """
         if case.folder.resolve().parent != self.workspace.resolve():
             raise InputError(

@@ -29,13 +29,7 @@ class Strict(BaseModel):
 
 
 def offered(kind: type, *without: str) -> dict[str, Any]:
-    """Return the fields of a model that state those settings of a data class that have an option.
-
-    Parameters
-    ----------
-    kind : the data class.
-    without : names of settings that are left out.
-    """
+    """Return the fields of a model that state the settings of a data class with an option, `without` some names."""
     found = {}
     for one in fields(kind):
         if "option" in one.metadata and one.name not in without:
@@ -174,10 +168,7 @@ class Choices(OfVessel):
     def of(cls, settings: Settings) -> Self:
         """Return the settings of a study that can be changed on the page.
 
-        Raises
-        ------
-        ValidationError, InputError
-            The page does not support a setting.
+        Raises ValidationError or InputError: the page does not support a setting.
         """
         flow, varied = settings.flow, settings.uncertainty
         chosen = told(cls, settings.input, settings.anatomy)

@@ -91,11 +91,8 @@ def _paths(folder: Path, source: str, settings: "Settings") -> dict[str, Path]:
 def reopened(cases: Cases, folder: Path) -> Case:
     """Create a case from the folder of a study.
 
-    Raises
-    ------
-    ReadError
-        The folder does not state its input and settings, is from another version, or has a setting that the page does
-        not support.
+    Raises ReadError: the folder does not state its input and settings, is from another version, or has a setting that
+    the page does not support.
     """
     from vstent.study.folder import CACHE, INPUT
     from vstent.study.repeat import told_in

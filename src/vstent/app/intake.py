@@ -39,10 +39,7 @@ _TOO_MUCH: Final = (
 def checked_name(name: str) -> str:
     """Return the name of an upload if it is a plain name of a file that can be read.
 
-    Raises
-    ------
-    ReadError
-        The name is a path, hidden, too long, or of an unsupported kind.
+    Raises ReadError: the name is a path, hidden, too long, or of an unsupported kind.
     """
     is_plain = name and not any(mark in name for mark in ("/", "\\", "\0")) and not name.startswith(".")
     if not is_plain or len(name) > LONGEST_NAME or not name.isprintable():
@@ -58,10 +55,7 @@ def checked_name(name: str) -> str:
 def take(partial: Path, name: str, case_folder: Path) -> None:
     """Move a complete upload, with its name on the user's machine, into the case folder; `partial` is removed.
 
-    Raises
-    ------
-    ReadError
-        The file is damaged, unpacks to too many bytes, or there are too many files.
+    Raises ReadError: the file is damaged, unpacks to too many bytes, or there are too many files.
     """
     folder = case_folder / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
@@ -79,10 +73,7 @@ def take(partial: Path, name: str, case_folder: Path) -> None:
 def found(case_folder: Path) -> str:
     """Return the path of the uploaded scan or surface, relative to the case folder.
 
-    Raises
-    ------
-    ReadError
-        There is no scan or surface, or more than one.
+    Raises ReadError: there is no scan or surface, or more than one.
     """
     from vstent.io.images import files_of  # imported late so that the first page appears sooner
 

@@ -167,18 +167,9 @@ class BareFlowStore:
 
 
 class LiveFlowProcess:
-    """Live flow of one anatomy.
+    """Live flow of one anatomy, steady; without a store the flow without a device is stored nowhere.
 
-    Parameters
-    ----------
-    anatomy : vessel with a sac.
-    settings : settings of the flow, which is steady.
-    store : where the flow without a device is stored; None: nowhere.
-
-    Raises
-    ------
-    InputError
-        The vessel has no sac.
+    Raises InputError: the vessel has no sac.
     """
 
     def __init__(self, anatomy: Anatomy, settings: FlowSettings, store: BareFlowStore | None = None) -> None:
@@ -243,11 +234,9 @@ class LiveFlowProcess:
         self._sender.send(device)
 
     def message(self, seen: int = 0) -> bytes:
-        """Return the numbers and new streamlines as a message for the page; the process goes on for a while.
+        """Return the numbers as a message for the page, and streamlines of another number than it has seen.
 
-        Parameters
-        ----------
-        seen : number of the streamlines that the page has; they are not sent again. 0: none.
+        The process continues for a while.
         """
         if not self._process.is_alive() and not self._reading.error:
             if self._reading.fraction >= 1.0:  # it had begun to step

@@ -109,10 +109,7 @@ class Preview:
     def anatomy(self) -> Anatomy:
         """Last anatomy found.
 
-        Raises
-        ------
-        ReadError
-            There is no anatomy yet.
+        Raises ReadError: there is no anatomy yet.
         """
         key = self.case.state.anatomy
         path = self.case.folder / CACHE / f"anatomy-{key}.npz"
@@ -123,10 +120,7 @@ class Preview:
     def choice(self, name: str) -> Treatment:
         """Return a chosen treatment by its name.
 
-        Raises
-        ------
-        ReadError
-            It is not chosen.
+        Raises ReadError: it is not chosen.
         """
         for treatment in self.case.state.choices.treatments:
             if treatment.name == name:
@@ -232,10 +226,7 @@ class Preview:
     def plan(self) -> bytes:
         """Return the plan of the chosen treatments as PDF, one page per implant.
 
-        Raises
-        ------
-        InputError
-            No device is chosen, or one does not fit.
+        Raises InputError: no device is chosen, or one does not fit.
         """
         from vstent.reporting.plan_sheet import Planned, plan_pdf
 
@@ -371,10 +362,7 @@ class Preview:
     def flow_message(self, moment: int | None) -> bytes:
         """Return wall shear stress, streamlines and a cut of every flow, on common color scales.
 
-        Raises
-        ------
-        ReadError
-            Flows are missing.
+        Raises ReadError: flows are missing.
         """
         with LOCK:
             paths = kept_flows(self.case.folder)
@@ -396,10 +384,7 @@ class Preview:
     def films_message(self, direction: str, *, has_wires: bool = False, moment: int | None = None) -> bytes:
         """Return the films of every flow along one direction; empty: along the working projection.
 
-        Raises
-        ------
-        ReadError
-            The angiogram has not been computed.
+        Raises ReadError: the angiogram has not been computed.
         """
         with LOCK:
             paths = kept_histories(self.case.folder)
@@ -417,11 +402,7 @@ class Preview:
     def section(self, name: str | None, implant: str | None, abscissa_mm: float) -> dict[str, Any]:
         """Return the section by a plane across the parent axis: curves in the plane, in mm, and diameters.
 
-        Parameters
-        ----------
-        name : treatment to include; None: none.
-        implant : id of the implant whose diameters are returned; None: the first.
-        abscissa_mm : position of the plane along the parent axis.
+        It shows the treatment of a name, where one is given, with the diameters of one implant, or else of the first.
         """
         with LOCK:
             anatomy = self.anatomy

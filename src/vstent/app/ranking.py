@@ -44,12 +44,8 @@ def rank_sizes(case: Case, progress: OnProgress) -> None:
 
     The ranking by geometry is stored before the first flow. Finished flows are kept, so that a stopped ranking goes on.
 
-    Raises
-    ------
-    InputError
-        No device is chosen, or flows are wanted and there is no sac or no suitable size.
-    FlowError
-        The flow without a device cannot be computed.
+    Raises InputError: no device is chosen, or flows are wanted and there is no sac or no suitable size.
+    Raises FlowError: the flow without a device cannot be computed.
     """
     settings = case.state.settings()
     keys = anatomy_keys(case.state.source, settings)

@@ -60,13 +60,7 @@ LOCK: Final = threading.RLock()
 
 
 class Scan:
-    """A scan as the page shows it.
-
-    Parameters
-    ----------
-    image : the whole scan.
-    crop_mm : (2, 3) opposite corners of the box in which the vessel is sought, LPS mm; None: the whole scan.
-    """
+    """A scan as the page shows it, and the box in it, by opposite corners (2, 3), in which the vessel is sought."""
 
     def __init__(self, image: Image, crop_mm: Floats | None = None) -> None:
         self.image = image
@@ -155,10 +149,7 @@ class Scan:
         The slice lies across a voxel axis; a slab includes so many slices on each side of it. An upright slice is an
         anatomical plane of an oblique scan, interpolated between its voxels.
 
-        Raises
-        ------
-        InputError
-            There is no such slice.
+        Raises InputError: there is no such slice.
         """
         grid = self.upright if is_upright else None
         count = (self.image.voxels.shape if grid is None else grid.shape)[axis]

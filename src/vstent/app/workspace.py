@@ -41,10 +41,7 @@ class Workspace:
     def open(self, path: Path) -> None:
         """Open an input of the command line: a case of the page, one of `vstent run`, or a scan or surface.
 
-        Raises
-        ------
-        ReadError
-            The path does not exist.
+        Raises ReadError: the path does not exist.
         """
         existing(path)
         if (path / STATE).is_file():
@@ -144,12 +141,8 @@ class Workspace:
     def start(self, case: Case, kind: str) -> None:
         """Start a job of a kind: anatomy, rank, flow or angiogram.
 
-        Raises
-        ------
-        ReadError
-            There is no scan or surface, or it was moved.
-        InputError
-            No device is chosen, or the flow of an angiogram is not up to date.
+        Raises ReadError: there is no scan or surface, or it was moved.
+        Raises InputError: no device is chosen, or the flow of an angiogram is not up to date.
         """
         if not case.input.exists():
             raise ReadError(f"The scan of {case.state.name} has been moved from {case.input}. Put it back there.")
@@ -190,10 +183,7 @@ class Workspace:
     def live_flow(self, case: Case) -> Any:
         """Return the live flow of a case; start it where it does not run, or runs for another anatomy or flow.
 
-        Raises
-        ------
-        InputError
-            The vessel has no sac.
+        Raises InputError: the vessel has no sac.
         """
         from vstent.app.live import BareFlowStore, LiveFlowProcess
         from vstent.flow.settings import FlowSettings
@@ -215,10 +205,7 @@ class Workspace:
     def prepare_live_flow(self, case: Case) -> bool:
         """Begin to compute the live flow without a device, so that numbers follow soon when it is switched on.
 
-        Raises
-        ------
-        InputError
-            The vessel has no sac.
+        Raises InputError: the vessel has no sac.
         """
         from vstent.app.live import FREE_BYTES
         from vstent.flow.memory import free_memory_bytes
@@ -241,10 +228,7 @@ class Workspace:
     def scan(self, case: Case) -> Any:
         """Return the scan of a case.
 
-        Raises
-        ------
-        InputError
-            The case has a surface, or no input yet.
+        Raises InputError: the case has a surface, or no input yet.
         """
         import numpy as np
 
@@ -275,10 +259,7 @@ class Workspace:
     def input_surface(self, case: Case) -> bytes:
         """Return the surface of the input as read, as a message for the page.
 
-        Raises
-        ------
-        InputError
-            The case has a scan, or the surface cannot be read.
+        Raises InputError: the case has a scan, or the surface cannot be read.
         """
         from vstent.io.surfaces import read_surface
         from vstent.reporting.packing import message
@@ -336,10 +317,7 @@ class Workspace:
 def keep_picture(case: Case, data: bytes) -> None:
     """Store the picture of a case.
 
-    Raises
-    ------
-    InputError
-        It is not a PNG file.
+    Raises InputError: it is not a PNG file.
     """
     if not data.startswith(b"\x89PNG\r\n\x1a\n"):
         raise InputError("The picture of a case must be a PNG file.")
@@ -350,10 +328,7 @@ def keep_picture(case: Case, data: bytes) -> None:
 def begin_upload(case: Case, name: str) -> Path:
     """Return a file to write an upload to.
 
-    Raises
-    ------
-    InputError
-        The case already has its input, or the name is that of neither a scan nor a surface.
+    Raises InputError: the case already has its input, or the name is that of neither a scan nor a surface.
     """
     if case.state.source:
         raise InputError(f"{case.state.name} already has its scan or surface. Make another case for {name}.")

@@ -160,7 +160,7 @@ def device_sentences(metrics: Mapping[str, Any]) -> list[str]:
     for implants in by_device.values():
         titles = implants if len(implants) > 1 else [""]
         parts = zip(implants.values(), titles, strict=True)
-        told = (how_sure(implant, title, is_told=n > 0) for n, (implant, title) in enumerate(parts))
+        told = (how_sure(implant, title, is_repeated=n > 0) for n, (implant, title) in enumerate(parts))
         sentences.append(_spaced(" ".join(told)))
     return sentences
 

@@ -27,24 +27,13 @@ def film_case(
 ) -> dict[str, Angiogram]:
     """Carry contrast through the flows of a case folder, and film it into the subfolder ``angiogram``.
 
-    Parameters
-    ----------
-    out : the case folder of a finished run with flows.
-    settings : settings of the angiograms; as many frames are computed as the films need.
-    film : how films are taken.
-    progress : called at every stage.
-    study : fields of patient and study for the DICOM files; None: none.
+    The run has flows. As many frames are computed as the films need. `study` has the fields of patient and study for
+    the DICOM files. Returns angiograms by name of the flow, ``bare`` first.
 
-    Returns angiograms by name of the flow, ``bare`` first.
-
-    Raises
-    ------
-    ReadError
-        The folder holds no finished run of this version.
-    InputError
-        The run has no flow, the window is too short, or the vessel needs a larger detector than there are.
-    FlowError
-        A flow does not fit in the free memory.
+    Raises ReadError: the folder holds no finished run of this version.
+    Raises InputError: the run has no flow, the window is too short, or the vessel needs a larger detector than there
+    are.
+    Raises FlowError: a flow does not fit in the free memory.
     """
     settings = replace(settings, frames_per_s=max(settings.frames_per_s, film.frame_rate_Hz))
     found, histories = angiograms(out, settings, progress)
@@ -68,15 +57,7 @@ def film_case(
 def write_report_again(out: Path, progress: OnProgress) -> None:
     """Write the report of a finished case folder with its films; the PDF too where there is one.
 
-    Parameters
-    ----------
-    out : the case folder.
-    progress : called at every stage.
-
-    Raises
-    ------
-    ReadError
-        The input of the case has been moved.
+    Raises ReadError: the input of the case has been moved.
     """
     record = read_record(out / RUN)
     case = run(record.input, out, record.settings, progress)

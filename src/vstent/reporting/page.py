@@ -156,8 +156,8 @@ def contents_of(case: "CaseResult", drawing: Drawing | None = None) -> Contents:
     told: set[str] = set()
     for name, key, title, deployment in titled(case.implants):
         measured = metrics["treatments"][name]["implants"][key]
-        is_told = deployment.stent.design.key in told
-        implants.append(_implant(title, deployment, measured, (name, key), is_told=is_told))
+        is_repeated = deployment.stent.design.key in told
+        implants.append(_implant(title, deployment, measured, (name, key), is_repeated=is_repeated))
         told.add(deployment.stent.design.key)
     return Contents(
         name=case.name,
@@ -237,9 +237,9 @@ def asset(name: str) -> str:
 
 
 def _implant(
-    title: str, deployment: Deployment, measured: dict[str, Any], path: tuple[str, str], *, is_told: bool
+    title: str, deployment: Deployment, measured: dict[str, Any], path: tuple[str, str], *, is_repeated: bool
 ) -> dict[str, Any]:
-    """Return title, words, advice, quantities and facts of one implant; the facts only where they are not told yet."""
+    """Return title, words, advice, quantities and facts of one implant; facts are not repeated."""
     stent = deployment.stent
     diameters = ", ".join(f"{d:g}" for d in np.unique(stent.wire_diameter_um))
     wires = f"{len(stent.wire_diameter_um)} wires or struts of {diameters} µm"
@@ -251,9 +251,9 @@ def _implant(
         "words": f"{wires}. The contour {how} after {steps}, in {deployment.seconds:.2f} s.",
         "advice": deployment.advice,
         "quantities": flatten({key: value for key, value in measured.items() if key != "bands"}, path),
-        "how_sure": how_sure(measured, is_told=is_told),
+        "how_sure": how_sure(measured, is_repeated=is_repeated),
         "bands": band_rows(measured),
-        "facts": [] if is_told else facts,
+        "facts": [] if is_repeated else facts,
     }
 
 

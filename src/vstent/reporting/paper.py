@@ -23,12 +23,9 @@ BADGE: Final = "Research use only. Not a medical device."
 
 
 class Paper:
-    """Pages that are filled from top to bottom.
+    """Pages that are filled from top to bottom; the title has the name of the case and the kind of document.
 
-    Parameters
-    ----------
-    name, kind : name of the case, and what the document is; both stand in its title.
-    scale : factor of everything on the pages; below 1 more fits on one. All inches below are before scaling.
+    A scale below 1 makes everything smaller, so that more fits on a page. All inches below are before scaling.
     """
 
     def __init__(self, name: str, kind: str = "report", *, scale: float = 1.0) -> None:
@@ -113,14 +110,7 @@ class Paper:
         self._y -= 0.05
 
     def table(self, rows: Iterable[Sequence[str]], widths: Sequence[float], *, head: Sequence[str] = ()) -> None:
-        """Write a table: the first column is aligned left, the others right.
-
-        Parameters
-        ----------
-        rows : cells of every row.
-        widths : width of every column as a fraction of the text width.
-        head : column titles; empty: none.
-        """
+        """Write a table with columns of a fraction of the text width, the first aligned left, the others right."""
         if head:
             self._row(head, widths, QUIET, "bold")
         for row in rows:

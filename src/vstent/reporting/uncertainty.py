@@ -72,11 +72,11 @@ def ends(implant: Mapping[str, Any], key: str) -> str:
     return "" if low == high else f"({number if unit else low} to {high})"
 
 
-def how_sure(implant: Mapping[str, Any], title: str = "", *, is_told: bool = False) -> str:
+def how_sure(implant: Mapping[str, Any], title: str = "", *, is_repeated: bool = False) -> str:
     """Return the sentences on how sure a device is; empty where the metrics of the implant do not state it.
 
     Where several implants are of one device, `title` tells them apart, and the sentence on the numbers of the device
-    is left out once it is told.
+    is left out where it is repeated.
     """
     bands = implant.get("bands", {})
     if not bands:
@@ -87,9 +87,9 @@ def how_sure(implant: Mapping[str, Any], title: str = "", *, is_told: bool = Fal
             cause = bands["results"][key].get("cause")
             because = f" (mostly the {number_name(cause)})" if cause else ""
             ranges.append(f"{Quantity((key,), 0.0).name.lower()} {band[1:-1]}{because}")
-    sentences = [] if is_told else [bands["device"]]
+    sentences = [] if is_repeated else [bands["device"]]
     if ranges:
-        whose = "its" if is_told else "these"
+        whose = "its" if is_repeated else "these"
         sentences.append(f"Within the ranges of {whose} numbers{f' ({title})' if title else ''}: {'; '.join(ranges)}.")
     sizes = bands.get("proposed_sizes", "")
     if " to " in sizes:
