@@ -1,13 +1,16 @@
-"""Compile the kernels of the contrast transport ahead of their first use."""
+"""Compile the kernels of angiograms ahead of their first use."""
 
 import numpy as np
 
 from vstent.angiography.network import Network
 from vstent.angiography.transport import Transport
+from vstent.kernels.footprints import footprints
 
 
 def warm() -> None:
-    """March a frame through two cells; numba keeps the compiled code."""
+    """March a frame through two cells, and project one; numba keeps the compiled code."""
+    arm = np.array([1.0, 2.0, 1.0, 1.0, 1.0])
+    footprints(np.zeros((1, 3)), np.ones(1), np.eye(3), arm, np.array([2, 2]))
     cells = np.array([[0, 0, 0], [0, 0, 1]])
     two = Network(
         cells=cells,

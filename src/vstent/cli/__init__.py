@@ -24,7 +24,7 @@ FAILED: Final = 1
 """Exit code where a computation failed."""
 INTERRUPTED: Final = 130
 """Exit code after Ctrl-C."""
-HELPER: Final = (sys.executable, "-m", "vstent.cli.warm")
+HELPER: Final = (sys.executable, "-c", "from vstent.cli.warm import last; last()")
 """Command of a second process that compiles the kernels needed last while this process compiles those needed first."""
 
 

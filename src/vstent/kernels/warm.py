@@ -1,24 +1,22 @@
-"""Compile the shared kernels that take time to compile, ahead of their first use."""
+"""Compile the shared kernels that take time to compile, ahead of their first use; numba keeps the compiled code."""
 
 import numpy as np
 
-from vstent.kernels import coverage, curves, digits, footprints, medial, net, raster, sampling, tree, triangles, voxels
+from vstent.kernels import coverage, curves, digits, medial, net, raster, sampling, tree, triangles, voxels
 
 
 def warm() -> None:
-    """Call every kernel once with very small arrays; numba keeps the compiled code."""
+    """Call every kernel of a study without a flow once with very small arrays."""
     row, column = np.meshgrid(np.arange(3.0), np.arange(4.0), indexing="ij")
     nodes = np.stack([np.cos(np.pi / 2 * column), np.sin(np.pi / 2 * column), row], axis=-1)
-    _sample()
     _slide(nodes)
     coverage.covered_fractions(nodes, nodes[0], nodes[1], np.full(4, 0.01), 2)
     _search()
     _paint()
+    voxels.fill(np.zeros((0, 3, 3)), (1, 1, 1))
     curves.parallel_frames(np.eye(3))
     curves.closed_lengths(nodes)
-    arm = np.array([1.0, 2.0, 1.0, 1.0, 1.0])
-    footprints.footprints(np.zeros((1, 3)), np.ones(1), np.eye(3), arm, np.array([2, 2]))
-    digits.text_rows(["", ""], arm[None].astype(np.int64)[:, :1], 0)
+    digits.text_rows(["", ""], np.ones((1, 1), dtype=np.int64), 0)
     medial.widest_in_section(np.ones((1, 2)), np.ones((1, 2, 2)), 1.0, np.ones(1))
 
 
@@ -55,9 +53,8 @@ def _slide(nodes_mm: np.ndarray) -> None:
     net.slide(tiny, net.Weights(1.5, 0.1, 0.1, 0.1, 1, 0.1), net.Descent(1, 0.1, 0.1))
 
 
-def _sample() -> None:
-    """Interpolate a field on a grid of one cell."""
+def sample() -> None:
+    """Interpolate a flow on a grid of one cell."""
     index, numbers, points = np.zeros((2, 2, 2), np.int32), np.zeros(1), np.zeros((0, 3))
     sampling.interpolate_cubic(index, np.zeros((1, 3)), points)
     sampling.fit_wall(index, numbers, np.zeros((1, 3)), numbers, points, points, 1)
-    voxels.fill(np.zeros((0, 3, 3)), (1, 1, 1))
