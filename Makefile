@@ -60,11 +60,12 @@ $(VENV)/.ready: pyproject.toml $(wildcard src/vstent/kernels/*.py src/vstent/flo
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --editable ".[app]"
-	$(BIN)/python -m vstent.cli.warm
+	$(BIN)/python -m vstent.cli.warm study
 	@touch $@
 
 $(VENV)/.ready-dev: $(VENV)/.ready
 	$(BIN)/python -m pip install --quiet --group dev
+	$(BIN)/python -m vstent.cli.warm
 	@touch $@
 
 $(VENV)/.ready-docs: $(VENV)/.ready-dev

@@ -29,7 +29,7 @@ OUT_OF_MEMORY: Final = (
     "spacing (--grid-spacing)."
 )
 """Message where the memory does not suffice."""
-HELPER: Final = (sys.executable, "-m", "vstent.cli.warm")
+HELPER: Final = (sys.executable, "-c", "from vstent.cli.warm import last; last()")
 """Command of a second process that compiles the kernels needed last while this process compiles those needed first."""
 
 

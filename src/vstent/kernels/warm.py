@@ -19,12 +19,9 @@ from vstent.kernels import (
 
 
 def warm() -> None:
-    """Call every kernel once with very small arrays; numba keeps the compiled code."""
+    """Call every kernel of a study without a flow once with very small arrays; numba keeps the compiled code."""
     line, around = np.meshgrid(np.arange(3.0), np.arange(4.0), indexing="ij")
     nodes = np.stack([np.cos(np.pi / 2 * around), np.sin(np.pi / 2 * around), line], axis=-1)
-    index, numbers, points = np.zeros((2, 2, 2), np.int32), np.zeros(1), np.zeros((0, 3))
-    sampling.interpolate_cubic(index, np.zeros((1, 3)), points)
-    sampling.fit_wall(index, numbers, np.zeros((1, 3)), numbers, points, points, 1)
     voxels.fill(np.zeros((0, 3, 3)), (1, 1, 1))
     _slide(nodes)
     coverage.covered_fractions(nodes, nodes[0], nodes[1], np.full(4, 0.01), 2)
@@ -43,8 +40,6 @@ def warm() -> None:
     raster.resolve(image, sums, depth, 1)
     curves.parallel_frames(np.eye(3))
     curves.closed_lengths(nodes)
-    geometry = np.array([1.0, 2.0, 1.0, 1.0, 1.0])
-    footprints.footprints(np.zeros((1, 3)), np.ones(1), np.eye(3), geometry, np.array([2, 2]))
     digits.text_rows(["", ""], np.ones((1, 1), np.int64), 0)
     medial.widest_in_section(np.ones((1, 2)), np.ones((1, 2, 2)), 1.0, np.ones(1))
 
@@ -59,3 +54,16 @@ def _slide(nodes_mm: np.ndarray) -> None:
     few, next_to, pieces, wires = (values.astype(np.uint32) for values in (line, beside, ends, bends))
     tiny = net.Net(chart, line, column, few, next_to, pieces, np.ones(2), np.zeros(3), wires, pieces)
     net.slide(tiny, net.Weights(1.5, 0.1, 0.1, 0.1, 1, 0.1), net.Descent(1, 0.1, 0.1))
+
+
+def sample() -> None:
+    """Interpolate a flow on a grid of one cell."""
+    index, numbers, points = np.zeros((2, 2, 2), np.int32), np.zeros(1), np.zeros((0, 3))
+    sampling.interpolate_cubic(index, np.zeros((1, 3)), points)
+    sampling.fit_wall(index, numbers, np.zeros((1, 3)), numbers, points, points, 1)
+
+
+def project() -> None:
+    """Project a point on a detector of four pixels."""
+    arm = np.array([1.0, 2.0, 1.0, 1.0, 1.0])
+    footprints.footprints(np.zeros((1, 3)), np.ones(1), np.eye(3), arm, np.array([2, 2]))
