@@ -3,13 +3,17 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test validation check lint benchmark docs licences wheel-check bounds-check viewer-check sentences clean
+.PHONY: demo test system validation check lint benchmark docs licences wheel-check bounds-check viewer-check sentences clean
 
 demo: $(VENV)/.ready
 	$(BIN)/vstent demo --out demo
 
 test: $(VENV)/.ready-dev
-	$(BIN)/python -m pytest -m "not validation" -n auto --dist loadfile
+	$(BIN)/python -m pytest -m "not validation and not system" -n auto --dist loadfile
+
+# Commands that are killed at any stage, clusters, the simulator's benchmark, and walks of the page in a browser.
+system: $(VENV)/.ready-dev
+	$(BIN)/python -m pytest -m system -n auto
 
 validation: $(VENV)/.ready-dev
 	$(BIN)/python tools/record.py validation

@@ -102,7 +102,11 @@ EVERY = [
 ]
 
 
-@pytest.mark.parametrize("moments", [BRIEF, pytest.param(EVERY, marks=pytest.mark.validation)], ids=["once", "often"])
+@pytest.mark.parametrize(
+    "moments",
+    [pytest.param(BRIEF, marks=pytest.mark.system), pytest.param(EVERY, marks=pytest.mark.validation)],
+    ids=["once", "often"],
+)
 def test_killed_at_any_stage_the_same_command_goes_on(moments: list[str], tmp_path: Path) -> None:
     write_stl(tmp_path / "artery.stl", artery())
     assert killed("never", tmp_path / "artery.stl", tmp_path / "whole") == 0

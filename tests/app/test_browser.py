@@ -45,6 +45,7 @@ def artery(tmp_path):
     return path
 
 
+@pytest.mark.system
 def test_from_a_dropped_surface_to_a_device_dragged(artery, tmp_path):
     with app_case.served(tmp_path / "cases") as client, browsing(client) as page:
         assert page.locator(".badge").inner_text() == "Research use only"
@@ -75,6 +76,7 @@ def test_from_a_dropped_surface_to_a_device_dragged(artery, tmp_path):
         type_while_the_page_is_redrawn(client, page)
 
 
+@pytest.mark.system
 def test_of_a_treatment_with_two_implants_both_are_shown_and_each_is_moved(artery, tmp_path):
     study = tmp_path / "study"
     command = ["run", str(artery), "--out", str(study), "--units", "mm", "--treatment", "silk + silk@-4", "--no-flow"]
@@ -146,6 +148,7 @@ def test_the_blood_follows_a_device_that_is_dragged(artery, tmp_path):
         assert not page.locator(".live-cards").is_visible()
 
 
+@pytest.mark.system
 def test_sizes_are_sorted_compared_and_saved_as_a_picture(artery, tmp_path):
     with app_case.served(tmp_path / "cases") as client, browsing(client, 1024, 768) as page:
         drop(page, artery)
@@ -213,6 +216,7 @@ WITHOUT_SHORT_STEPS = """
 """The state in which the vessel is sought never comes, as on a busy machine."""
 
 
+@pytest.mark.system
 def test_a_tick_lets_blood_enter_by_an_opening_as_well(artery, tmp_path):
     with app_case.served(tmp_path / "cases") as client, browsing(client) as page:
         page.add_init_script(WITHOUT_SHORT_STEPS)

@@ -40,6 +40,7 @@ def heading(page, title):
     playwright.expect(page.locator(".panel h2").first).to_have_text(title)
 
 
+@pytest.mark.system
 def test_the_page_keeps_its_manners(client):
     """Back, names of outlets, proposed values, definitions, the list of cases, and a new key, in one visit."""
     with browsing(client, 1024, 768, expected="401") as page:

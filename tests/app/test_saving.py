@@ -81,6 +81,7 @@ def client(tmp_path):
         yield client
 
 
+@pytest.mark.system
 def test_any_view_is_saved_as_png_and_as_svg(client):
     with browsing(client, 1366, 768) as page:
         page.locator(".recent-case").click()

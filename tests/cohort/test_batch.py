@@ -140,6 +140,7 @@ def test_a_device_whose_flow_fails_leaves_the_files_of_the_others(scans, tmp_pat
     assert [path.name for path in (task.folder / "study" / "treatments").iterdir()] == ["silk"]
 
 
+@pytest.mark.system
 def test_a_worker_killed_midway_is_replaced_and_the_table_is_the_same(scans, table, tmp_path):
     cases = find_cases(scans, GIVEN)
     victims = []
@@ -161,6 +162,7 @@ def test_a_worker_killed_midway_is_replaced_and_the_table_is_the_same(scans, tab
     assert bare(collect(cases, tmp_path)) == table
 
 
+@pytest.mark.system
 def test_a_case_whose_process_always_dies_costs_only_itself_and_is_done_by_the_next_run(
     scans, table, tmp_path, monkeypatch
 ):
@@ -332,6 +334,7 @@ def test_outliers_are_found_by_the_modified_z_score():
     assert "://" not in page
 
 
+@pytest.mark.system
 @needs_dask
 def test_a_dask_worker_killed_midway_gives_the_same_table_and_a_lost_scheduler_keeps_what_is_done(
     scans, table, tmp_path, monkeypatch
@@ -392,6 +395,7 @@ QUEUE = {
 """A queue of Slurm's commands that starts every job at once."""
 
 
+@pytest.mark.system
 @needs_dask
 def test_slurm_jobs_that_the_queue_ends_are_asked_for_anew(scans, table, tmp_path, monkeypatch):
     pytest.importorskip("dask_jobqueue")

@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import vstent
 from vstent import phantoms
 from vstent.io.writers import write_stl
@@ -57,6 +59,7 @@ def alter(file: Path, before: str, after: str) -> None:
     file.write_text(text.replace(before, after))
 
 
+@pytest.mark.system
 def test_a_changed_line_computes_what_depends_on_it_and_nothing_else(tmp_path: Path) -> None:
     package = tmp_path / "package" / "vstent"
     shutil.copytree(Path(vstent.__file__).parent, package)

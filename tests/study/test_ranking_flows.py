@@ -5,6 +5,7 @@ import signal
 from functools import cache
 from types import SimpleNamespace
 
+import pytest
 from ranked_artery import anatomy, wall
 
 import vstent
@@ -33,6 +34,7 @@ def killed(task: FlowTask) -> None:
     ranking_flows.work(task)
 
 
+@pytest.mark.system
 def test_a_killed_process_loses_one_flow_and_the_next_run_gives_the_bits_of_one_after_the_other(tmp_path, monkeypatch):
     (tmp_path / CACHE).mkdir()
     chosen, told = chosen_of(ranking(), 2), []

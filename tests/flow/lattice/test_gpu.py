@@ -296,6 +296,7 @@ def benchmark(*words: str, **environment: str) -> str:
     return ran.stdout
 
 
+@pytest.mark.system
 def test_the_benchmark_runs_through_on_the_simulator() -> None:
     said = benchmark("--tiny", NUMBA_ENABLE_CUDASIM="1")
     for part in ("| even_step |", "| drive |", "launched one by one", "whole flows", "bytes per cell", "Measured in"):
