@@ -19,7 +19,7 @@ from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Centerline
 from vstent.kernels import curves, smoothing, triangles
 from vstent.kernels.arrays import Floats, freeze
-from vstent.kernels.isosurface import isosurface
+from vstent.kernels.voxels import isosurface
 
 AXIS_STEP_MM: Final = 0.04
 """Distance between the points of an axis, in mm."""

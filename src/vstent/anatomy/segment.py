@@ -17,7 +17,7 @@ from vstent.geometry.vessel import Vessel
 from vstent.io.surfaces import GIANT_DIAMETER_MM, VESSEL_DIAMETER_MM
 from vstent.kernels import smoothing, topology, triangles
 from vstent.kernels.arrays import Bools, Floats
-from vstent.kernels.isosurface import isosurface
+from vstent.kernels.voxels import isosurface
 from vstent.units import place
 
 FEWEST_VOXELS: Final = 300
@@ -91,10 +91,13 @@ def segment(image: Image, *, threshold: float | None = None, at_mm: Floats | Non
             "view. Set another threshold (--threshold), choose a point in the artery (--at), or crop the scan "
             "where the two touch."
         )
-    surface, smooth_note = _smooth(_wall(lumen))
+    rough = _wall(lumen)
+    surface, volume_mm3 = _taubin(rough), rough.closed.volume_mm3
+    lost = volume_mm3 - surface.closed.volume_mm3
+    vertices_mm = surface.vertices_mm + (lost / surface.area_mm2) * surface.vertex_normals
+    surface = Surface(vertices_mm, surface.faces)
     if threshold is None:
         surface = _unblurred(surface, profile)
-    surface, decimation_notes = _decimated(surface)
     size = " x ".join(f"{h:.3g}" for h in image.spacing_mm)
     share = lumen.n_voxels / lumen.n_above
     count = f"The lumen has {lumen.n_voxels} voxels of {size} mm, {share:.0%} of all voxels above the threshold."
@@ -106,9 +109,18 @@ def segment(image: Image, *, threshold: float | None = None, at_mm: Floats | Non
     band_mm = 2 * off / profile.slope_per_mm
     band = f"A change of the threshold by {off:.3g} ({BAND:.0%} of the step from tissue to lumen) changes diameters by "
     band += f"+-{band_mm:.3f} mm ({band_mm / lumen.voxel_mm:.2f} voxel)."
+    smoothing_note = f"Smoothing changed the volume by {-lost / volume_mm3:+.2%}; the change was corrected."
+    notes = [*image.notes, note, band, count, smoothing_note]
+    if len(surface.faces) > MOST_FACES:  # reduced by quadric error (Garland and Heckbert 1997, SIGGRAPH)
+        import fast_simplification
+
+        fine, mesh = surface, (np.array(surface.vertices_mm), np.array(surface.faces))
+        surface = Surface(*fast_simplification.simplify(*mesh, target_count=MOST_FACES))
+        change = surface.closed.volume_mm3 / fine.closed.volume_mm3 - 1
+        notes.append(f"{len(fine.faces)} triangles reduced to {len(surface.faces)} (volume {change:+.2%}).")
     return Vessel(
         surface,
-        notes=(*image.notes, note, band, count, smooth_note, *decimation_notes),
+        notes=tuple(notes),
         threshold_band_mm=band_mm,
         blur_mm=profile.blur_mm,
         voxel_mm=lumen.voxel_mm,
@@ -341,16 +353,6 @@ def _taubin(surface: Surface) -> Surface:
     return Surface(vertices, surface.faces)
 
 
-def _smooth(rough: Surface) -> tuple[Surface, str]:
-    """Return the smoothed surface with its volume restored, and a note."""
-    volume = rough.closed.volume_mm3
-    smooth = _taubin(rough)
-    lost = volume - smooth.closed.volume_mm3
-    vertices = smooth.vertices_mm + (lost / smooth.area_mm2) * smooth.vertex_normals
-    note = f"Smoothing changed the volume by {-lost / volume:+.2%}; the change was corrected."
-    return Surface(vertices, smooth.faces), note
-
-
 def _unblurred(surface: Surface, profile: Profile) -> Surface:
     """Return the wall shifted by s^2 times the excess of its mean curvature over that of the whole vessel."""
     # The threshold is right for the radius of the whole vessel. With it, a thin branch is too narrow and a sac too
@@ -369,16 +371,3 @@ def _unblurred(surface: Surface, profile: Profile) -> Surface:
     shift_mm = profile.blur_mm**2 * (curvature - typical)
     shift_mm = np.clip(shift_mm, -0.5 * profile.voxel_mm, 0.5 * profile.voxel_mm)
     return Surface(surface.vertices_mm + shift_mm[:, None] * surface.vertex_normals, surface.faces)
-
-
-def _decimated(fine: Surface) -> tuple[Surface, tuple[str, ...]]:
-    """Return a mesh reduced to `MOST_FACES` by quadric error (Garland and Heckbert 1997, SIGGRAPH), and a note."""
-    if len(fine.faces) <= MOST_FACES:
-        return fine, ()
-    import fast_simplification
-
-    coarse = Surface(
-        *fast_simplification.simplify(np.array(fine.vertices_mm), np.array(fine.faces), target_count=MOST_FACES)
-    )
-    change = coarse.closed.volume_mm3 / fine.closed.volume_mm3 - 1
-    return coarse, (f"{len(fine.faces)} triangles reduced to {len(coarse.faces)} (volume {change:+.2%}).",)

@@ -14,7 +14,7 @@ from vstent.geometry.image import Image
 from vstent.geometry.surface import Surface
 from vstent.kernels import topology, triangles
 from vstent.kernels.arrays import Floats, freeze
-from vstent.kernels.isosurface import isosurface
+from vstent.kernels.voxels import isosurface
 from vstent.reporting.packing import Packer, message
 from vstent.reporting.scene import FRONTAL, MeshLayer, view_of
 from vstent.reporting.thinning import thin_surface

@@ -58,8 +58,7 @@ def build(vertices: Floats, faces: Ints) -> Tree:
     corners = vertices[faces]
     order = _median_order(corners.mean(axis=1))
     corners = np.ascontiguousarray(corners[order])
-    n_leaves = 1 << int(np.ceil(np.log2(max(1, len(faces)))))
-    return Tree(vertices, faces, corners, order, *_boxes(corners, n_leaves, np.zeros(len(corners))))
+    return Tree(vertices, faces, corners, order, *_boxes(corners, 0.0))
 
 
 def curved(tree: Tree, normals: Floats) -> Tree:
@@ -69,7 +68,7 @@ def curved(tree: Tree, normals: Floats) -> Tree:
     triangle the contributions of the edges are added.
     """
     rise = triangles.edge_rises(tree.corners, normals[tree.face])
-    low, high = _boxes(tree.corners, (len(tree.low) + 1) // 2, np.abs(rise).sum(axis=1) / 8)
+    low, high = _boxes(tree.corners, np.abs(rise).sum(axis=1, keepdims=True) / 8)
     return replace(tree, low=low, high=high, rise=rise)
 
 
@@ -118,28 +117,21 @@ def _part(key: Any, order: Any, first: int, last: int, middle: int) -> None:
             last = j
 
 
-@njit(cache=True)
-def _boxes(corners: Any, n_leaves: int, margin: Any) -> tuple[Any, Any]:
-    """Return the lower and upper corner (nodes, 3) of each node's box, with a margin (m,) around the triangles.
+def _boxes(corners: Floats, margin: Floats | float) -> tuple[Floats, Floats]:
+    """Return the lower and upper corner (nodes, 3) of each node's box, with a margin (m, 1) around the triangles.
 
     Boxes of nodes without triangles are at infinity.
     """
-    low = np.full((2 * n_leaves - 1, 3), np.inf)
-    high = np.full((2 * n_leaves - 1, 3), -np.inf)
-    for f in range(len(corners)):
-        leaf = n_leaves - 1 + f
-        for k in range(3):
-            for corner in range(3):
-                low[leaf, k] = min(low[leaf, k], corners[f, corner, k] - margin[f])
-                high[leaf, k] = max(high[leaf, k], corners[f, corner, k] + margin[f])
-    for node in range(2 * n_leaves - 2, 0, -1):
-        for k in range(3):
-            low[(node - 1) // 2, k] = min(low[(node - 1) // 2, k], low[node, k])
-            high[(node - 1) // 2, k] = max(high[(node - 1) // 2, k], high[node, k])
-    for node in range(2 * n_leaves - 1):
-        for k in range(3):
-            if low[node, k] == np.inf:  # every ray would enter a box from inf to -inf
-                high[node, k] = np.inf
+    n_leaves = 1 << int(np.ceil(np.log2(max(1, len(corners)))))
+    low, high = np.full((2 * n_leaves - 1, 3), np.inf), np.full((2 * n_leaves - 1, 3), -np.inf)
+    leaves = slice(n_leaves - 1, n_leaves - 1 + len(corners))
+    low[leaves], high[leaves] = corners.min(axis=1) - margin, corners.max(axis=1) + margin
+    while n_leaves > 1:
+        n_leaves //= 2
+        nodes, children = slice(n_leaves - 1, 2 * n_leaves - 1), slice(2 * n_leaves - 1, 4 * n_leaves - 1)
+        low[nodes] = low[children].reshape(-1, 2, 3).min(axis=1)
+        high[nodes] = high[children].reshape(-1, 2, 3).max(axis=1)
+    high[low == np.inf] = np.inf  # every ray would enter a box from inf to -inf
     return low, high
 
 

@@ -16,7 +16,7 @@ from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Aneurysm, Centerline, Vessel
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Bools, Floats, Ints
-from vstent.kernels.regions import region
+from vstent.kernels.smoothing import region
 
 ON_ARTERY_MM: Final = 0.5
 """A flank is attached to the parent artery if its rim comes this close to the height where it begins, in mm."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from vstent.kernels import regions, triangles
+from vstent.kernels import smoothing, triangles
 
 
 def sheet(n: int = 61, size_mm: float = 12.0) -> tuple[np.ndarray, np.ndarray]:
@@ -19,7 +19,7 @@ def test_stiffness_is_the_dirichlet_energy_of_a_linear_function() -> None:
     vertices, faces = sheet()
     slope = vertices @ np.array([0.3, -0.4, 0.0])
     # Right angles have a cotangent of 0, which counts as 0.05: the diagonals add a twentieth of their differences.
-    energy = 0.5 * slope @ (regions.stiffness(vertices, faces) @ slope)
+    energy = 0.5 * slope @ (smoothing.stiffness(vertices, faces) @ slope)
     np.testing.assert_allclose(energy, 0.5 * 0.25 * 144.0, rtol=0.06)
 
 
@@ -31,7 +31,7 @@ def test_a_disc_stays_where_its_gain_balances_its_curvature_and_loses_its_spike(
     gain = gamma * np.clip(np.where(spike, 0.1, radius_mm - distance), -0.5, 0.5)
     edge = np.zeros(len(vertices), dtype=bool)
     edge[np.unique(triangles.open_edges(faces))] = True
-    level = regions.region(vertices, faces, gain, edge, 0.5)
+    level = smoothing.region(vertices, faces, gain, edge, 0.5)
     cut, kept, _ = triangles.clip(vertices, faces, level)
     (loop,) = triangles.boundary_loops(cut, kept)
     # Where gain = curvature, gamma (R - r) = 1 / r: r = 2.91 mm, all around, but for the foot of the spike. It stops
