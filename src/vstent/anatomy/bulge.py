@@ -58,7 +58,7 @@ def prominence(inside: Bools, spacing_mm: Floats) -> float:
     stride = max(1, int(np.ceil((inside.size / MOST_VOXELS) ** (1 / 3))))
     inside, spacing_mm = inside[::stride, ::stride, ::stride], spacing_mm * stride
     radius_mm = ndimage.distance_transform_edt(inside, sampling=spacing_mm)
-    left, found = radius_mm.copy(), 1.0
+    left, ratio = radius_mm.copy(), 1.0
     extent_mm = np.linalg.norm(np.ptp(np.argwhere(inside), axis=0) * spacing_mm)
     if extent_mm < SHORTEST * left.max():
         return 1.0
@@ -72,8 +72,8 @@ def prominence(inside: Bools, spacing_mm: Floats) -> float:
             left[around & (share == SHARES[0])] = 0.0
             if reach_mm > COMPACT * widest_mm:
                 break
-            found = max(found, 1 / share)
-    return found
+            ratio = max(ratio, 1 / share)
+    return ratio
 
 
 def prominence_of_surface(surface: Surface) -> float:

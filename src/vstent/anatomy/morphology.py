@@ -76,15 +76,15 @@ def morphology(anatomy: Anatomy) -> Morphology:
 
     Piccinelli et al. 2009, IEEE Trans. Med. Imaging 28:1141.
     """
-    found: Morphology = {**_parent(anatomy)}
+    result: Morphology = {**_parent(anatomy)}
     if anatomy.vessel.threshold_band_mm > 0:
-        found["diameter_threshold_band_mm"] = anatomy.vessel.threshold_band_mm
-    found |= _course(anatomy)
+        result["diameter_threshold_band_mm"] = anatomy.vessel.threshold_band_mm
+    result |= _course(anatomy)
     for number, aneurysm in enumerate(anatomy.aneurysms, start=1):
         beside = _parent(replace(anatomy, aneurysms=(aneurysm,)))
         measures = _sac(aneurysm, anatomy.parent.axis, 0.5 * sum(beside.values()))
-        found |= measures if number == 1 else {f"sac_{number}": {**beside, **measures}}
-    return found
+        result |= measures if number == 1 else {f"sac_{number}": {**beside, **measures}}
+    return result
 
 
 def _parent(anatomy: Anatomy) -> dict[str, float]:
@@ -104,7 +104,7 @@ def _course(anatomy: Anatomy) -> Measures:
     even_mm = curves.resample_evenly(axis.points_mm, len(axis.points_mm))
     curvature, torsion = curves.curvature_and_torsion(even_mm, diameter_mm)
     is_bent = inner & (curvature * diameter_mm > BENT)
-    found: Measures = {
+    measures: Measures = {
         "parent_mean_curvature_per_mm": float(curvature[inner].mean()),
         "parent_max_curvature_per_mm": float(curvature[inner].max()),
         "parent_mean_torsion_per_mm": float(np.abs(torsion[is_bent]).mean()) if is_bent.any() else 0.0,
@@ -112,8 +112,8 @@ def _course(anatomy: Anatomy) -> Measures:
     if anatomy.aneurysms:
         proximal_mm, distal_mm = neck_span_mm(anatomy)
         at_neck = np.interp(np.linspace(proximal_mm, distal_mm, 51), axis.abscissa_mm, curvature)
-        found["neck_mean_curvature_per_mm"] = float(at_neck.mean())
-    return found
+        measures["neck_mean_curvature_per_mm"] = float(at_neck.mean())
+    return measures
 
 
 def _sac(aneurysm: Aneurysm, axis: Centerline, parent_diameter_mm: float) -> Measures:

@@ -128,7 +128,7 @@ def _reachable(vessel: Vessel, spheres: medial.Medial) -> tuple[Vessel, medial.M
     is_reached[:first] = True
     notes = tuple(f"An opening {opening.described} has no connection to the inlet and was closed." for opening in lost)
     openings = named(vessel.inlets, [opening for opening in vessel.openings if opening not in lost])
-    return replace(vessel, openings=openings, notes=(*vessel.notes, *notes)), graph.keep(is_reached)
+    return replace(vessel, openings=openings, notes=(*vessel.notes, *notes)), graph.where(is_reached)
 
 
 def _radius_cap(graph: medial.Medial, paths: Sequence[Ints]) -> Floats:

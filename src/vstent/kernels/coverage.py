@@ -77,14 +77,14 @@ def _downhill(nodes: Any, point: Any, row: int, column: int) -> tuple[int, int]:
 
 
 @njit(cache=True)
-def _gather(first: Any, row: int, column: int, rows: int, columns: int, found: Any) -> int:
-    """Write the segments whose home is within one node of a cell into `found` and return their number."""
+def _gather(first: Any, row: int, column: int, rows: int, columns: int, near: Any) -> int:
+    """Write the segments whose home is within one node of a cell into `near` and return their number."""
     n = 0
     for i in range(max(0, row - 1), min(rows, row + 3)):
         for step in range(-1, 3):
             node = i * columns + (column + step) % columns
-            for k in range(first[node], min(first[node + 1], first[node] + found.size - n)):
-                found[n] = k
+            for k in range(first[node], min(first[node + 1], first[node] + near.size - n)):
+                near[n] = k
                 n += 1
     return n
 

@@ -32,18 +32,18 @@ class Medial(NamedTuple):
     edges: Ints
     """(e, 2) pairs of spheres whose Delaunay tetrahedra share a face."""
 
-    def keep(self, is_kept: Bools) -> "Medial":
-        """Return the part of the graph on the vertices (n,) that are kept."""
-        number = np.cumsum(is_kept) - 1
-        edges = self.edges[is_kept[self.edges].all(axis=1)]
-        return Medial(self.points[is_kept], self.radius[is_kept], number[edges].astype(np.int32))
+    def where(self, mask: Bools) -> "Medial":
+        """Return the part of the graph on the vertices where a mask (n,) is true."""
+        number = np.cumsum(mask) - 1
+        edges = self.edges[mask[self.edges].all(axis=1)]
+        return Medial(self.points[mask], self.radius[mask], number[edges].astype(np.int32))
 
     def largest(self) -> "Medial":
         """Return the connected part with most spheres; sampling leaves a few isolated ones."""
         if not len(self.points):
             return self
         label = joined(self.edges, len(self.points))
-        return self.keep(label == np.argmax(np.bincount(label)))
+        return self.where(label == np.argmax(np.bincount(label)))
 
 
 def with_terminals(medial: Medial, terminals: Floats, reach: Floats) -> Medial:
@@ -105,19 +105,19 @@ def spheres(samples: Floats, normals: Floats, closed: Tree, ends: Floats) -> Med
     behind = np.einsum("tkd,tkd->tk", offset, normals[delaunay.simplices]) < 0
     is_inside = (radius < extent) & np.isfinite(center).all(axis=1) & behind.all(axis=1)
     if not is_inside.any():
-        return every.keep(is_inside)
+        return every.where(is_inside)
     unsure = is_inside & (radius > 2.0 * np.quantile(radius[is_inside], 0.9))
     if len(ends):
         unsure |= is_inside & (cKDTree(ends).query(center)[0] < 3.0 * radius)
     is_inside[unsure] = sees_inside(closed, center[unsure], -offset[unsure, 0])
-    return every.keep(is_inside).largest()
+    return every.where(is_inside).largest()
 
 
 def within(medial: Medial, closed: Tree) -> Medial:
     """Return the largest connected part of the graph among the spheres whose centres lie inside a closed surface."""
     askew = np.array([0.756, 0.539, 0.371])  # an oblique ray does not graze rows of triangles along an axis
     inside = sees_inside(closed, medial.points, np.broadcast_to(askew, medial.points.shape))
-    return medial.keep(inside).largest()
+    return medial.where(inside).largest()
 
 
 def arms(medial: Medial, roots: Ints, least_cost: float, least_radius: float) -> list[Ints]:

@@ -58,7 +58,7 @@ def _beyond(
     """Return the measures (k, 2 + w) of the part beyond each plane, and whether it has no open edge (k,)."""
     measures, is_closed = np.zeros((len(points), terms.shape[1] - 2)), np.zeros(len(points), dtype=np.bool_)
     height = np.zeros(len(vertices))
-    seen, stack, kept = np.zeros((3, len(faces)), dtype=np.int32)
+    seen, stack, cut = np.zeros((3, len(faces)), dtype=np.int32)
     shares = np.zeros((len(faces), terms.shape[1]))
     ring, total = np.zeros((4, 3)), np.zeros(terms.shape[1])
     for k in range(len(points)):
@@ -81,7 +81,7 @@ def _beyond(
                 total += terms[f]
             else:
                 seen[f] = 2
-                kept[n_cut] = f
+                cut[n_cut] = f
                 n_cut += 1
                 _part(vertices, faces[f], height, terms[f], ring, shares[f])
                 total += shares[f]
@@ -95,7 +95,7 @@ def _beyond(
                         stack[n] = g
                         n += 1
         if is_closed[k]:
-            _add_pouches(faces, neighbours, terms, height, seen, stack, kept[:n_cut], shares, total)
+            _add_pouches(faces, neighbours, terms, height, seen, stack, cut[:n_cut], shares, total)
         measures[k, 0] = (total[0] - 2.0 * (p[0] * total[1] + p[1] * total[2] + p[2] * total[3])) / 6.0
         measures[k, 1] = q[0] * total[1] + q[1] * total[2] + q[2] * total[3]
         measures[k, 2:] = total[4:]
