@@ -336,7 +336,7 @@ class Preview:
             self._show(self.stents(treatment))
             layers = self._drawn(treatment.name, treatment, colour)
             landing = landing_of(chosen, on_path(self.anatomy, chosen.placing.path), stent.size)
-            found = laid_inside(partial(sketch, self._bed(chosen)), landing or Landing(_center_mm(stent)))
+            found = laid_inside(partial(sketch, self._bed(chosen)), landing or Landing(stent.middle_abscissa_mm))
             return message(
                 layers,
                 scales_of(layers, self.anatomy),
@@ -499,11 +499,6 @@ def _formula_coverage(stent: Stent) -> Floats:
     return np.broadcast_to(np.array(of_row)[:, None], stent.nodes_mm.shape[:2])
 
 
-def _center_mm(stent: Stent) -> float:
-    """Return the position of the middle row along the parent axis."""
-    return float(stent.row_abscissa_mm[(len(stent.row_abscissa_mm) - 1) // 2])
-
-
 def _place(found: Sketch, stent: Stent) -> dict[str, Any]:
     """Return the position of a device, with bands of uncertainty around its ends."""
     ends = (stent.proximal_abscissa_mm, stent.distal_abscissa_mm)
@@ -517,7 +512,7 @@ def _place(found: Sketch, stent: Stent) -> dict[str, Any]:
     return {
         "device": stent.design.key,
         "size": stent.size.label,
-        "center_mm": _center_mm(stent),
+        "center_mm": stent.middle_abscissa_mm,
         "ends_mm": ends,
         "ends_band_mm": bands,
         "profile": np.round(np.stack([stent.row_abscissa_mm, stent.row_diameter_mm], axis=1), 3).tolist(),

@@ -27,21 +27,10 @@ _SHARED: Final[dict[str, Any]] = {}
 def spread(
     work: Callable[[Any, Item], Answer], common: Any, items: Sequence[Item], *, jobs: int = 1
 ) -> Iterator[Answer]:
-    """Yield ``work(common, item)`` for every item, in order.
+    """Yield ``work(common, item)`` for every item, in order; `work` is a function at the top level of a module.
 
-    Parameters
-    ----------
-    work : function at the top level of a module.
-    common : object; data that all items need, sent to every process once.
-    items : sequence; items to work on.
-    jobs : number of processes; with 1 the work is done in this process.
-
-    Yields result for each item.
-
-    Raises
-    ------
-    VstentError
-        A worker process ended unexpectedly.
+    The data that all items need, `common`, are sent to each of the `jobs` processes once. With one job the work is done
+    in this process. A VstentError says that a process ended unexpectedly.
     """
     if jobs <= 1 or len(items) <= 1:
         yield from (work(common, item) for item in items)

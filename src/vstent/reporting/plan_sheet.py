@@ -155,9 +155,8 @@ def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str,
 def _length(anatomy: Anatomy, deployment: Deployment) -> str:
     """Return the deployed length with its range."""
     stent = deployment.stent
-    middle_mm = float(stent.row_abscissa_mm[(len(stent.row_abscissa_mm) - 1) // 2])
     try:
-        found = laid_inside(partial(sketch, bed(stent.design, stent.size, anatomy)), Landing(middle_mm))
+        found = laid_inside(partial(sketch, bed(stent.design, stent.size, anatomy)), Landing(stent.middle_abscissa_mm))
     except LandingError:
         return f"{stent.deployed_length_mm:.1f} mm"
     lengths = sorted(b - a for a, b in zip(found.proximal_band_mm, found.distal_band_mm, strict=True))
