@@ -26,7 +26,7 @@ from vstent.deployment.contour import planes
 from vstent.deployment.deploy import propose_landing
 from vstent.deployment.measure import measure
 from vstent.deployment.method import laid_inside
-from vstent.deployment.sketch import Bed, Sketch, bed, sketch
+from vstent.deployment.sketch import MeasuredWall, Sketch, measured_wall, sketch
 from vstent.devices.catalogue import find_design
 from vstent.devices.formulas import coverage_fraction, free_diameters_mm
 from vstent.devices.stent import Deployment, Landing, Stent
@@ -127,15 +127,15 @@ class Preview:
                 return treatment
         raise ReadError(f"{name} is not among the chosen treatments.")
 
-    def _bed(self, implant: Implant) -> Bed:
+    def _wall(self, implant: Implant) -> MeasuredWall:
         """Return the artery prepared for an implant of the chosen size."""
         path, asked = implant.placing.path, (implant.device, implant.diameter_mm, implant.length_mm)
 
-        def prepare() -> Bed:
+        def prepare() -> MeasuredWall:
             anatomy = on_path(self.anatomy, path)
-            return bed(find_design(implant.device), size_of(implant, anatomy), anatomy)
+            return measured_wall(find_design(implant.device), size_of(implant, anatomy), anatomy)
 
-        return self._cached(("bed", self.case.state.anatomy, path, *asked), prepare)
+        return self._cached(("wall", self.case.state.anatomy, path, *asked), prepare)
 
     def _of_implant(self, what: str, treatment: Treatment, implant: Implant, compute: Callable[[], Found]) -> Found:
         """Return a cached result of a deployed implant; where there is none, compute and cache it."""
@@ -315,7 +315,7 @@ class Preview:
         """
         with LOCK:
             pane, chosen = treatment.name, _implant(treatment, implant)
-            wall, anatomy = self._bed(chosen), on_path(self.anatomy, chosen.placing.path)
+            wall, anatomy = self._wall(chosen), on_path(self.anatomy, chosen.placing.path)
             landing = landing or landing_of(chosen, anatomy, wall.size)
             if landing is None:
                 found = laid_inside(partial(sketch, wall), propose_landing(wall.design, anatomy, wall.size))
@@ -336,7 +336,7 @@ class Preview:
             self._show(self.stents(treatment))
             layers = self._drawn(treatment.name, treatment, colour)
             landing = landing_of(chosen, on_path(self.anatomy, chosen.placing.path), stent.size)
-            found = laid_inside(partial(sketch, self._bed(chosen)), landing or Landing(stent.middle_abscissa_mm))
+            found = laid_inside(partial(sketch, self._wall(chosen)), landing or Landing(stent.middle_abscissa_mm))
             return message(
                 layers,
                 scales_of(layers, self.anatomy),
