@@ -41,6 +41,7 @@ from vstent.geometry.vessel import Anatomy, Opening
 from vstent.io.archive import load_data
 from vstent.kernels import triangles
 from vstent.kernels.arrays import Floats
+from vstent.plan.bands import gap_bands
 from vstent.reporting.packing import message
 from vstent.reporting.scene import (
     STEEL_COLOUR,
@@ -194,10 +195,18 @@ class Preview:
         titles = implant_titles(self.deployed(treatment))
         return [sheets.device(titles[one.id], self._measures(treatment, one)) for one in treatment.implants]
 
-    def bands_sheet(self, treatment: Treatment, implant: str) -> dict[str, Any]:
-        """Return the bands of a deployed implant as the page shows them."""
+    def bands_sheet(self, treatment: Treatment, implant: str, *, has_gaps: bool = False) -> dict[str, Any]:
+        """Return the bands of a deployed implant as the page shows them; those of gaps take some seconds."""
+        chosen = _implant(treatment, implant)
         with LOCK:
-            metrics = self._metrics(treatment, _implant(treatment, implant))
+            metrics = self._metrics(treatment, chosen)
+            anatomy, deployment = self.anatomy, self.deployment(treatment, chosen)
+            gaps: dict[str, Any] = self._of_implant("gaps", treatment, chosen, dict)
+        if has_gaps and not gaps:  # other processes deploy the device, so that the page is answered meanwhile
+            found = gap_bands(anatomy, deployment, metrics, jobs=2)
+            gaps |= {name: band.metrics() for name, band in found.items()}
+        bands = metrics["bands"]
+        metrics = metrics | {"bands": bands | {"results": bands["results"] | gaps}}
         told = {"treatment": treatment.name, "implant": implant}
         return told | {"sentence": how_sure(metrics), "rows": band_rows(metrics)}
 
