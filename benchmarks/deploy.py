@@ -22,7 +22,7 @@ from vstent.deployment.contour import planes
 from vstent.deployment.deploy import METHODS, deploy, propose_landing
 from vstent.deployment.measure import measure
 from vstent.deployment.method import Placement, run
-from vstent.deployment.sketch import bed, sketch
+from vstent.deployment.sketch import measured_wall, sketch
 from vstent.deployment.struts import struts
 from vstent.deployment.wall import AbstractWall, Contact, landing_wall
 from vstent.devices import catalogue
@@ -157,7 +157,7 @@ def speed(anatomy: Anatomy) -> list[str]:
     done, deploy_s = timed(lambda: deploy(design, anatomy, size=size, landing=landing))
     _, measure_s = timed(lambda: measure(anatomy, done))
     _, struts_s = timed(lambda: struts(done.stent))
-    ready = bed(design, size, anatomy)
+    ready = measured_wall(design, size, anatomy)
     sketched, sketch_s = timed(lambda: sketch(ready, landing))
     apart_mm = np.linalg.norm(sketched.stent.nodes_mm - done.stent.nodes_mm, axis=2)
     wall = CountingWall(landing_wall(anatomy)[0])

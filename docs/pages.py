@@ -116,14 +116,14 @@ def draw_device(design: Any, size: Any, path: Path) -> None:
     from matplotlib.figure import Figure
     from tubes import line, tube
 
-    from vstent.deployment.sketch import bed, sketch
+    from vstent.deployment.sketch import measured_wall, sketch
     from vstent.devices.stent import Landing
 
     wide = 1.4 * max([size.free_diameter_mm, *(diameter for _, diameter in size.free_profile_mm)])
     figure = Figure(figsize=(9, 2.6))
     axes = figure.subplots(2, 1, sharex=True, sharey=True)
     for axis, diameter_mm in zip(axes, (wide, _artery_mm(design, size)), strict=True):
-        stent = sketch(bed(design, size, tube(line(100), 0.5 * diameter_mm)), Landing(50.0)).stent
+        stent = sketch(measured_wall(design, size, tube(line(100), 0.5 * diameter_mm)), Landing(50.0)).stent
         here = stent.piece_starts
         ends = np.stack([stent.wire_points_mm[here], stent.wire_points_mm[here + 1]], axis=1)
         width = stent.wire_diameter_um[stent.point_wires[here]] * 1e-3 * 72 * 9 * 0.95 / 50  # mm to points

@@ -295,6 +295,10 @@ def test_deployed_numbers_are_those_of_the_measures(client, case, workspace):
     low, value, high = (float(lengths[k].split("\u202f")[0]) for k in (2, 1, 3))
     assert low < value < high
     assert "Numbers of Silk: 2 cited" in sheet["sentence"]
+    with_gaps = client.post(f"{case}/bands?gaps=true", json=wanted(silk), timeout=300).json()
+    assert [row for row in with_gaps["rows"] if row in sheet["rows"]] == sheet["rows"]
+    assert len(with_gaps["rows"]) == len(sheet["rows"]) + 2
+    assert client.post(f"{case}/bands", json=wanted(silk)).json() == with_gaps  # they are kept
     wires = next(layer for layer in told["layers"] if layer["id"] == "wires")
     coverage = app_case.numbers(wires["values"], data)
     assert coverage.mean() == pytest.approx(100 * measures["metal_coverage_fraction"], rel=0.05)

@@ -10,7 +10,7 @@ from tubes import arc, line, tube
 from vstent.deployment import cells, pieces
 from vstent.deployment.deploy import deploy
 from vstent.deployment.measure import measure, wire_stretches
-from vstent.deployment.sketch import bed, sketch
+from vstent.deployment.sketch import measured_wall, sketch
 from vstent.devices import catalogue
 from vstent.devices.formulas import grid, row_spacing_mm
 
@@ -143,7 +143,7 @@ def test_a_joint_that_passes_the_next_one_is_pushed_back(monkeypatch):
 
 
 def test_a_sketch_lifts_the_same_cells():
-    ready = bed(ENTERPRISE, SIZE, bend())
+    ready = measured_wall(ENTERPRISE, SIZE, bend())
     from vstent.deployment.deploy import propose_landing
 
     drawn = sketch(ready, propose_landing(ENTERPRISE, bend(), SIZE))

@@ -17,7 +17,7 @@ from vstent.deployment.coverage import coverage_fractions, quad_areas_mm2
 from vstent.deployment.deploy import deploy, propose_landing, propose_size
 from vstent.deployment.measure import measure
 from vstent.deployment.method import SPARE_MM, check_inside, laid_inside
-from vstent.deployment.sketch import bed, sketch
+from vstent.deployment.sketch import measured_wall, sketch
 from vstent.devices import catalogue, formulas
 from vstent.devices import design as device
 from vstent.devices.stent import Landing
@@ -521,7 +521,7 @@ def test_a_landing_point_off_the_artery_is_refused_as_what_it_is(abscissa_mm, me
     with pytest.raises(LandingError, match=r"^A landing at .* mm is not on the parent artery, which spans 0-32\.0 mm"):
         deploy(SILK, straight(), size=SILK_SIZE, landing=Landing(abscissa_mm), method=method)
     with pytest.raises(LandingError, match="is not on the parent artery"):
-        sketch(bed(SILK, SILK_SIZE, straight()), Landing(abscissa_mm))
+        sketch(measured_wall(SILK, SILK_SIZE, straight()), Landing(abscissa_mm))
 
 
 def test_a_device_has_three_points_to_land_it_by():

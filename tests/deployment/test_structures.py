@@ -10,7 +10,7 @@ from tubes import arc, line, on_parent, tube
 from vstent.deployment.braid import over_openings
 from vstent.deployment.deploy import deploy
 from vstent.deployment.measure import measure, wire_stretches
-from vstent.deployment.sketch import bed, sketch
+from vstent.deployment.sketch import measured_wall, sketch
 from vstent.deployment.struts import struts
 from vstent.devices.design import Braid, LaserCut, Size, Strands
 from vstent.devices.formulas import deployed_length_mm, free_diameters_mm, grid, mesh_rows, row_spacing_mm
@@ -98,11 +98,11 @@ def test_a_braid_with_closed_ends_is_as_many_closed_wires_as_its_rows_and_wires_
     for length_mm in (14.0, 15.0, 16.0, 17.0):
         size = Size(4.5, length_mm, 4.7)
         design = replace(LOOPED, sizes=(size,), strands=())
-        stent = sketch(bed(design, size, straight()), Landing(19.5)).stent
+        stent = sketch(measured_wall(design, size, straight()), Landing(19.5)).stent
         ends = stent.wire_points_mm[stent.wire_starts[:-1]], stent.wire_points_mm[stent.wire_starts[1:] - 1]
         assert np.allclose(*ends, atol=1e-12)
         assert len(stent.wire_diameter_um) == np.gcd(grid(design, size).lattice_rows - 1, 8)
-        open_ends = sketch(bed(replace(design, has_closed_ends=False), size, straight()), Landing(19.5)).stent
+        open_ends = sketch(measured_wall(replace(design, has_closed_ends=False), size, straight()), Landing(19.5)).stent
         assert stent.wire_length_mm == pytest.approx(open_ends.wire_length_mm, rel=0.02)
 
 
@@ -121,7 +121,7 @@ def test_in_a_wide_artery_flared_ends_open_to_their_own_free_diameter():
     wanted_mm = free_diameters_mm(FLARED, FLARED.sizes[0])
     assert done.stent.row_diameter_mm == pytest.approx(wanted_mm, rel=0.01)
     assert abs(wire_stretches(done.stent).mean()) < 0.01
-    fast = sketch(bed(FLARED, FLARED.sizes[0], wide), Landing(20.0)).stent
+    fast = sketch(measured_wall(FLARED, FLARED.sizes[0], wide), Landing(20.0)).stent
     assert fast.deployed_length_mm == pytest.approx(done.stent.deployed_length_mm, rel=0.01)
     assert fast.row_diameter_mm == pytest.approx(wanted_mm, rel=0.02)
 

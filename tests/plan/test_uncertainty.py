@@ -250,14 +250,17 @@ def test_inflow_and_flow_are_varied_where_the_flow_is_asked(monkeypatch):
 def test_a_sample_whose_flow_is_done_is_not_computed_again(monkeypatch, tmp_path):
     asked = []
 
-    def ratios(anatomy, stent, flow):
-        asked.append(flow.inflow_mL_s)
+    def ratios(_, inflow_mL_s):
+        asked.append(inflow_mL_s)
         if len(asked) == 3:
             raise KeyboardInterrupt
-        return {"neck_inflow_mL_s_ratio": flow.inflow_mL_s**2}
+        return {"neck_inflow_mL_s_ratio": inflow_mL_s**2}
 
-    monkeypatch.setattr(uncertainty, "_flow_ratios", ratios)
-    monkeypatch.setattr("vstent.flow.problem.ostium", lambda *_: None)
+    monkeypatch.setattr(uncertainty, "ratios", ratios)
+    monkeypatch.setattr(uncertainty, "simulate_case", lambda case, start=None: case)
+    monkeypatch.setattr(uncertainty, "indices", lambda case, *_: case.inflow_mL_s)
+    for module in ("vstent.flow.problem.ostium", "vstent.plan.uncertainty.ostium"):
+        monkeypatch.setattr(module, lambda *_: None)
     ranges = Ranges(4, flow_samples=4, threshold_mm=0.0, landing_mm=0.5, device_mm=0.0)
     begun, flow = Unfinished(tmp_path, "vary silk-key"), FlowSettings(inflow_mL_s=4.0)
     with pytest.raises(KeyboardInterrupt):

@@ -15,6 +15,7 @@ export class Deploying {
     this.sketches = new Newest((answer) => this.sketched(answer), page.complain);
     this.whole = new Newest((answer) => this.deployed(answer), page.complain);
     this.bands = new Newest((sheet) => !this.isDragging && page.toldBands(sheet), page.complain);
+    this.gaps = new Newest((sheet) => sheet && !this.isDragging && page.toldBands(sheet), page.complain); // the bands with those of gaps
     this.sections = new Newest((answer) => page.section.show(answer), () => {});
     this.cursorMark = { element: make("i", { className: "cursor-mark" }), point: () => this.cursor !== undefined && this.axis.at(this.cursor) };
     this.handles = ["proximal", "distal"].map((end, i) => this.handle(end, i));
@@ -38,6 +39,7 @@ export class Deploying {
   slide(anchor, mm) {
     this.wanted = mm;
     if (!this.isDragging) this.page.toldBands(null);
+    this.atRestAs = null;
     this.isDragging = true;
     const wanted = { ...this.wantedNow(), colour: this.page.colour, anchor, abscissa_mm: mm };
     this.sketches.ask(() => postBinary(`${this.page.path}/sketch`, wanted));
@@ -88,7 +90,10 @@ export class Deploying {
     const wanted = this.wantedNow();
     clearTimeout(this.rest);
     this.rest = setTimeout(() => {
-      if (!this.isDragging && wanted) this.bands.ask(() => post(`${this.page.path}/bands`, wanted));
+      if (this.isDragging || !wanted) return;
+      this.atRestAs = wanted;
+      const gaps = async () => this.atRestAs === wanted && (await post(`${this.page.path}/bands?gaps=true`, wanted).then((sheet) => this.atRestAs === wanted && sheet));
+      this.bands.ask(() => post(`${this.page.path}/bands`, wanted).then((sheet) => (this.gaps.ask(gaps), sheet)));
     }, REST_MS);
   }
 

@@ -26,7 +26,7 @@ from vstent.deployment.contour import planes
 from vstent.deployment.deploy import propose_landing
 from vstent.deployment.measure import measure
 from vstent.deployment.method import laid_inside
-from vstent.deployment.sketch import Bed, Sketch, bed, sketch
+from vstent.deployment.sketch import MeasuredWall, Sketch, measured_wall, sketch
 from vstent.devices.catalogue import find_design
 from vstent.devices.formulas import coverage_fraction, free_diameters_mm
 from vstent.devices.stent import Deployment, Landing, Stent
@@ -41,6 +41,7 @@ from vstent.geometry.vessel import Anatomy, Opening
 from vstent.io.archive import load_data
 from vstent.kernels import triangles
 from vstent.kernels.arrays import Floats
+from vstent.plan.bands import gap_bands
 from vstent.reporting.packing import message
 from vstent.reporting.scene import (
     STEEL_COLOUR,
@@ -127,15 +128,15 @@ class Preview:
                 return treatment
         raise ReadError(f"{name} is not among the chosen treatments.")
 
-    def _bed(self, implant: Implant) -> Bed:
+    def _wall(self, implant: Implant) -> MeasuredWall:
         """Return the artery prepared for an implant of the chosen size."""
         path, asked = implant.placing.path, (implant.device, implant.diameter_mm, implant.length_mm)
 
-        def prepare() -> Bed:
+        def prepare() -> MeasuredWall:
             anatomy = on_path(self.anatomy, path)
-            return bed(find_design(implant.device), size_of(implant, anatomy), anatomy)
+            return measured_wall(find_design(implant.device), size_of(implant, anatomy), anatomy)
 
-        return self._cached(("bed", self.case.state.anatomy, path, *asked), prepare)
+        return self._cached(("wall", self.case.state.anatomy, path, *asked), prepare)
 
     def _of_implant(self, what: str, treatment: Treatment, implant: Implant, compute: Callable[[], Found]) -> Found:
         """Return a cached result of a deployed implant; where there is none, compute and cache it."""
@@ -194,10 +195,18 @@ class Preview:
         titles = implant_titles(self.deployed(treatment))
         return [sheets.device(titles[one.id], self._measures(treatment, one)) for one in treatment.implants]
 
-    def bands_sheet(self, treatment: Treatment, implant: str) -> dict[str, Any]:
-        """Return the bands of a deployed implant as the page shows them."""
+    def bands_sheet(self, treatment: Treatment, implant: str, *, has_gaps: bool = False) -> dict[str, Any]:
+        """Return the bands of a deployed implant as the page shows them; those of gaps take some seconds."""
+        chosen = _implant(treatment, implant)
         with LOCK:
-            metrics = self._metrics(treatment, _implant(treatment, implant))
+            metrics = self._metrics(treatment, chosen)
+            anatomy, deployment = self.anatomy, self.deployment(treatment, chosen)
+            gaps: dict[str, Any] = self._of_implant("gaps", treatment, chosen, dict)
+        if has_gaps and not gaps:  # other processes deploy the device, so that the page is answered meanwhile
+            found = gap_bands(anatomy, deployment, metrics, jobs=2)
+            gaps |= {name: band.metrics() for name, band in found.items()}
+        bands = metrics["bands"]
+        metrics = metrics | {"bands": bands | {"results": bands["results"] | gaps}}
         told = {"treatment": treatment.name, "implant": implant}
         return told | {"sentence": how_sure(metrics), "rows": band_rows(metrics)}
 
@@ -315,7 +324,7 @@ class Preview:
         """
         with LOCK:
             pane, chosen = treatment.name, _implant(treatment, implant)
-            wall, anatomy = self._bed(chosen), on_path(self.anatomy, chosen.placing.path)
+            wall, anatomy = self._wall(chosen), on_path(self.anatomy, chosen.placing.path)
             landing = landing or landing_of(chosen, anatomy, wall.size)
             if landing is None:
                 found = laid_inside(partial(sketch, wall), propose_landing(wall.design, anatomy, wall.size))
@@ -336,7 +345,7 @@ class Preview:
             self._show(self.stents(treatment))
             layers = self._drawn(treatment.name, treatment, colour)
             landing = landing_of(chosen, on_path(self.anatomy, chosen.placing.path), stent.size)
-            found = laid_inside(partial(sketch, self._bed(chosen)), landing or Landing(_center_mm(stent)))
+            found = laid_inside(partial(sketch, self._wall(chosen)), landing or Landing(stent.middle_abscissa_mm))
             return message(
                 layers,
                 scales_of(layers, self.anatomy),
@@ -499,11 +508,6 @@ def _formula_coverage(stent: Stent) -> Floats:
     return np.broadcast_to(np.array(of_row)[:, None], stent.nodes_mm.shape[:2])
 
 
-def _center_mm(stent: Stent) -> float:
-    """Return the position of the middle row along the parent axis."""
-    return float(stent.row_abscissa_mm[(len(stent.row_abscissa_mm) - 1) // 2])
-
-
 def _place(found: Sketch, stent: Stent) -> dict[str, Any]:
     """Return the position of a device, with bands of uncertainty around its ends."""
     ends = (stent.proximal_abscissa_mm, stent.distal_abscissa_mm)
@@ -517,7 +521,7 @@ def _place(found: Sketch, stent: Stent) -> dict[str, Any]:
     return {
         "device": stent.design.key,
         "size": stent.size.label,
-        "center_mm": _center_mm(stent),
+        "center_mm": stent.middle_abscissa_mm,
         "ends_mm": ends,
         "ends_band_mm": bands,
         "profile": np.round(np.stack([stent.row_abscissa_mm, stent.row_diameter_mm], axis=1), 3).tolist(),

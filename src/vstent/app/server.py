@@ -368,8 +368,8 @@ def _add_scenes(api: APIRouter, work: Workspace, of_case: Any) -> None:
         return Binary(answer)
 
     @api.post("/api/cases/{case_id}/bands", summary="Bands of a deployed implant from the ranges of its numbers")
-    def bands(wanted: ImplantWanted, case: Case = of_case) -> dict[str, Any]:
-        return dict(work.preview(case).bands_sheet(wanted.treatment, wanted.implant))
+    def bands(wanted: ImplantWanted, case: Case = of_case, gaps: bool = False) -> dict[str, Any]:
+        return dict(work.preview(case).bands_sheet(wanted.treatment, wanted.implant, has_gaps=gaps))
 
     @api.get("/api/cases/{case_id}/section", summary="The section by a plane across the parent axis")
     def section(

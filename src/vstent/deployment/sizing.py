@@ -17,7 +17,7 @@ import numpy as np
 
 from vstent.anatomy.landing_zones import landing_diameters_mm, neck_span_mm
 from vstent.deployment.braid import expected_profile, march
-from vstent.deployment.sketch import bed
+from vstent.deployment.sketch import measured_wall
 from vstent.devices.design import Design, Size
 from vstent.devices.formulas import mesh_nodes
 from vstent.devices.stent import Landing, Stent
@@ -124,7 +124,7 @@ def _lies(design: Design, anatomy: Anatomy, size: Size) -> bool:
     """Return whether a size, landed as proposed, is expected to be apposed beside the neck."""
     first_mm, last_mm = _rows_mm(design, anatomy, size)[[0, -1]]
     proximal_mm, distal_mm = neck_span_mm(anatomy)
-    found = bed(design, size, anatomy)
+    found = measured_wall(design, size, anatomy)
     along_mm = found.abscissa_mm
     is_under = (along_mm >= first_mm) & (along_mm <= last_mm)
     is_loose = found.gap_mm[is_under & ((along_mm <= proximal_mm) | (along_mm >= distal_mm))] > APPOSED_GAP_MM

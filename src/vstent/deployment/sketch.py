@@ -1,7 +1,7 @@
 """Fast preview of a deployment, for a landing point that is moved interactively.
 
 The wall against which a device opens does not depend on where the device is landed. It is therefore measured once, on
-rays across the parent axis, up to the free diameter of the device (`Bed`). A sketch places the rows on this wall,
+rays across the parent axis, up to the free diameter of the device (`MeasuredWall`). A sketch places the rows on it,
 slides the crossings and draws the wires. Unlike `vstent.deployment.deploy.deploy`, it does not put the nodes to the
 wall again after the crossings have moved, and it does not recompute the row positions from the deployed diameters.
 """
@@ -32,7 +32,7 @@ ASSUMED_BAND_MM: Final = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Bed:
+class MeasuredWall:
     """Wall of an artery as it limits a device of one size."""
 
     design: Design
@@ -75,7 +75,7 @@ class Sketch:
     """Arc lengths of the distal end, in mm, for the smallest and the largest plausible diameters of the artery."""
 
 
-def bed(design: Design, size: Size, anatomy: Anatomy) -> Bed:
+def measured_wall(design: Design, size: Size, anatomy: Anatomy) -> MeasuredWall:
     """Measure the wall of an artery for a device, independent of where the device is landed."""
     axis, columns = anatomy.parent.axis, grid(design, size).columns
     across = planes(axis)
@@ -97,10 +97,10 @@ def bed(design: Design, size: Size, anatomy: Anatomy) -> Bed:
     band_mm = anatomy.vessel.threshold_band_mm or ASSUMED_BAND_MM
     is_opening = over_openings(anatomy, nodes_mm).reshape(gap_mm.shape)
     expected = expected_profile(design, size, anatomy)
-    return Bed(design, size, across, abscissa_mm, in_plane_mm, gap_mm, is_opening, expected, band_mm)
+    return MeasuredWall(design, size, across, abscissa_mm, in_plane_mm, gap_mm, is_opening, expected, band_mm)
 
 
-def sketch(wall: Bed, landing: Landing) -> Sketch:
+def sketch(wall: MeasuredWall, landing: Landing) -> Sketch:
     """Preview the device on a wall that is measured for it; a LandingError says that it extends beyond the artery."""
     design, size = wall.design, wall.size
     check_landing(landing, float(wall.abscissa_mm[-1]))

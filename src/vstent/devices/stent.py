@@ -114,6 +114,11 @@ class Stent:
         """Arc length of the distal end on the parent axis, in mm."""
         return float(self.row_abscissa_mm[-1])
 
+    @property
+    def middle_abscissa_mm(self) -> float:
+        """Arc length of the middle row on the parent axis, in mm."""
+        return float(self.row_abscissa_mm[(len(self.row_abscissa_mm) - 1) // 2])
+
     @cached_property
     def mesh_nodes(self) -> tuple[int, int]:
         """First and last row of nodes of the mesh. A dual-layer device has only its outer layer beyond them."""

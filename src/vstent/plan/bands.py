@@ -105,15 +105,16 @@ def bands(anatomy: Anatomy, deployment: Deployment, measures: Measures, *, is_pr
 def gap_bands(anatomy: Anatomy, deployment: Deployment, measures: Measures, *, jobs: int = 1) -> dict[str, Band]:
     """Compute the bands of a deployment's gaps from deployments at places in the ranges, on `jobs` processes.
 
-    With `jobs` above 1 no loop is compiled or run in this process. Devices that cannot be made or do not fit the artery
-    are left out.
+    With `jobs` above 1 no compiled loop runs in this process, and the others yield to it. Devices that cannot be made
+    or do not fit the artery are left out.
     """
     stent, ranges = deployment.stent, uncertain(deployment.stent.design)
     if not ranges or GAPS[0] not in measures:
         return {}
     points = centered_points(len(ranges), FEW_SAMPLES)
     common = anatomy, stent, Reduced(anatomy, deployment).landing
-    rows = list(spread(_gaps, common, [values_at(ranges, point) for point in points], jobs=jobs))
+    tasks = [values_at(ranges, point) for point in points]
+    rows = list(spread(_gaps, common, tasks, jobs=jobs, niceness=10))
     is_found = np.array([GAPS[0] in row for row in rows])
     if not is_found.any():
         return {}

@@ -16,7 +16,7 @@ from vstent.anatomy.morphology import Measures
 from vstent.deployment.braid import march
 from vstent.deployment.coverage import density
 from vstent.deployment.deploy import deploy
-from vstent.deployment.sketch import bed, sketch
+from vstent.deployment.sketch import measured_wall, sketch
 from vstent.devices.design import Design, Range, Size
 from vstent.devices.ranges import LENGTH, MARGIN, altered, values_at
 from vstent.devices.stent import Landing, Stent
@@ -58,7 +58,7 @@ def shortening(
     terms, ratios = [], []
     for design, size in [(stent.design, stent.size), *_altered(stent, ranges, SHORTENED_BY, PREVIEWED)]:
         with suppress(LandingError):  # it does not fit the artery: the others give the slopes
-            wall = bed(design, size, anatomy)
+            wall = measured_wall(design, size, anatomy)
             marched_mm = march(design, size, landing, wall.profile)[[0, -1]]
             lies_mm = sketch(wall, landing).stent.row_abscissa_mm[[0, -1]]
             ratios.append((lies_mm - landing.abscissa_mm) / (marched_mm - landing.abscissa_mm))

@@ -101,27 +101,19 @@ class Criterion(_Strict):
             raise ValueError("enough and beyond must be given together")
         if self.beyond is not None and not self.none < self.full <= self.enough < self.beyond:  # type: ignore[operator]
             raise ValueError("none < full <= enough < beyond must hold")
-        if not _has_one_place(self.phrase):
+        try:
+            has_one_place = self.phrase.format(0.0) != self.phrase.format(1.0)
+        except (LookupError, ValueError, AttributeError, TypeError):
+            has_one_place = False
+        if not has_one_place:
             raise ValueError("phrase must have one place for a number, such as {:.1f}")
         return self
-
-    def concerns(self, design: Design) -> bool:
-        """Return whether the criterion applies to a device."""
-        return self.weight > 0 and self.kind in (None, design.kind)
 
     def grade(self, value: float) -> float:
         """Return the grade of a value, 0 to 1."""
         rising = (value - self.none) / (self.full - self.none)
         falling = inf if self.beyond is None else (self.beyond - value) / (self.beyond - self.enough)  # type: ignore[operator]
         return float(np.clip(min(rising, falling), 0.0, 1.0))
-
-
-def _has_one_place(phrase: str) -> bool:
-    """Return whether a phrase can be formatted with one number and shows it."""
-    try:
-        return phrase.format(0.0) != phrase.format(1.0)
-    except (LookupError, ValueError, AttributeError, TypeError):
-        return False
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +125,7 @@ class Criteria:
 
     def of(self, design: Design) -> tuple[Criterion, ...]:
         """Return the criteria that apply to a device."""
-        return tuple(item for item in self.items if item.concerns(design))
+        return tuple(item for item in self.items if item.weight > 0 and item.kind in (None, design.kind))
 
 
 class _File(_Strict):
@@ -153,12 +145,7 @@ def default_criteria() -> Criteria:
 def read_criteria(path: Path) -> Criteria:
     """Read criteria from a TOML file in the form of ``vstent/plan/criteria.toml``.
 
-    Returns the criteria.
-
-    Raises
-    ------
-    InputError
-        The file does not exist, is not readable text or breaks the schema.
+    An InputError says that the file does not exist, is not readable text or breaks the schema.
     """
     try:
         text = existing(path).read_text(encoding="utf-8")
@@ -168,19 +155,9 @@ def read_criteria(path: Path) -> Criteria:
 
 
 def parse(text: str, name: str = "The file of criteria") -> Criteria:
-    """Read criteria from TOML text.
+    """Read criteria from TOML text; `name` is the name of the file in messages.
 
-    Parameters
-    ----------
-    text : content of the file.
-    name : name of the file in messages.
-
-    Returns the criteria.
-
-    Raises
-    ------
-    InputError
-        The text is not TOML or breaks the schema, all weights are 0, or a measure does not exist.
+    An InputError says that the text is not TOML or breaks the schema, all weights are 0, or a measure does not exist.
     """
     try:
         items = _File.model_validate(tomllib.loads(text)).criterion

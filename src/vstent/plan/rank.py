@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from vstent.deployment.deploy import deploy, propose_landing
 from vstent.deployment.measure import measure
 from vstent.deployment.sizing import propose_size
 from vstent.devices.design import Design, Size
-from vstent.devices.stent import Deployment, Landing
+from vstent.devices.stent import Landing
 from vstent.errors import InputError, LandingError
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels import curves
@@ -22,7 +22,6 @@ from vstent.plan.bands import length_band
 from vstent.plan.criteria import Criteria, Criterion, default_criteria
 from vstent.plan.workers import spread
 
-Value = TypeVar("Value")
 TELLING: Final = 0.005
 """Loss of score above which a reason names a criterion."""
 TOLD: Final = 2
@@ -57,6 +56,22 @@ class Candidate:
         """Names of device and size."""
         return f"{self.design.name} {self.size.label}"
 
+    @property
+    def row(self) -> dict[str, Any]:
+        """The candidate as one flat row."""
+        return {
+            "device": self.design.key,
+            "label_diameter_mm": self.size.diameter_mm,
+            "label_length_mm": self.size.length_mm,
+            "shift_mm": self.shift_mm,
+            "is_suitable": self.is_suitable,
+            "is_proposed": self.is_proposed,
+            "score": self.score,
+            "reason": self.reason,
+            **{f"grade_{key}": grade for key, grade in self.grades.items()},
+            **{key: value for key, value in self.measures.items() if key not in ("device", "size")},
+        }
+
 
 @dataclass(frozen=True, eq=False)
 class Ranking:
@@ -74,32 +89,11 @@ class Ranking:
 
     def rows(self) -> list[dict[str, Any]]:
         """Return one flat row per candidate: rank, device, size, shift, score, reason, grades and measures."""
-        return [_row(number, candidate) for number, candidate in enumerate(self.candidates, start=1)]
-
-
-def _row(number: int, candidate: Candidate) -> dict[str, Any]:
-    """Return a candidate as one flat row."""
-    return {
-        "rank": number,
-        "device": candidate.design.key,
-        "label_diameter_mm": candidate.size.diameter_mm,
-        "label_length_mm": candidate.size.length_mm,
-        "shift_mm": candidate.shift_mm,
-        "is_suitable": candidate.is_suitable,
-        "is_proposed": candidate.is_proposed,
-        "score": candidate.score,
-        "reason": candidate.reason,
-        **{f"grade_{key}": grade for key, grade in candidate.grades.items()},
-        **{key: value for key, value in candidate.measures.items() if key not in ("device", "size")},
-    }
+        return [{"rank": number} | candidate.row for number, candidate in enumerate(self.candidates, start=1)]
 
 
 def order_of(row: Mapping[str, Any]) -> tuple[bool, bool, float, str, float, float, float]:
-    """Return the sort key of a row that puts the best first.
-
-    Ties are sorted by name, size and shift, so the order is reproducible. Rows of versions that proposed no size count
-    as not proposed.
-    """
+    """Return the sort key of a row that puts the best first; ties are sorted by name, size and shift."""
     return (
         not row["is_suitable"],
         not row.get("is_proposed"),
@@ -148,7 +142,10 @@ def rank(
         There is no device or no shift to try.
     """
     criteria = criteria or default_criteria()
-    proposed = {(design.key, _proposed(design, anatomy)) for design in designs}
+    proposed = set()
+    for design in designs:
+        with suppress(LandingError):  # no size fits
+            proposed.add((design.key, propose_size(design, anatomy)))
     tasks = [(design, size, float(shift)) for design in designs for size in design.sizes for shift in shifts_mm]
     if not tasks:
         raise InputError("There is nothing to rank: give at least one device and one landing shift.")
@@ -162,36 +159,19 @@ def rank(
 
 
 def alternatives(anatomy: Anatomy, design: Design, size: Size, *, count: int = 2) -> tuple[Candidate, ...]:
-    """Return the best of the sizes next to one: the neighboring lengths, and the neighboring diameters.
-
-    Parameters
-    ----------
-    count : largest number of alternatives.
-    """
-    lengths = sorted(
-        (one for one in design.sizes if one.diameter_mm == size.diameter_mm), key=lambda one: one.length_mm
-    )
-    near = _beside(lengths, lengths.index(size))
+    """Return the best of the sizes next to one, at most `count`: the neighboring lengths and diameters."""
+    same = sorted((one for one in design.sizes if one.diameter_mm == size.diameter_mm), key=lambda one: one.length_mm)
+    place = same.index(size)
+    near = [*same[max(0, place - 1) : place], *same[place + 1 : place + 2]]
     diameters = sorted({one.diameter_mm for one in design.sizes})
-    for diameter_mm in _beside(diameters, diameters.index(size.diameter_mm)):
-        same = (one for one in design.sizes if one.diameter_mm == diameter_mm)
+    place = diameters.index(size.diameter_mm)
+    for diameter_mm in (*diameters[max(0, place - 1) : place], *diameters[place + 1 : place + 2]):
+        same = [one for one in design.sizes if one.diameter_mm == diameter_mm]
         near += sorted(same, key=lambda one: abs(one.length_mm - size.length_mm))[:2]
     if not near:
         return ()
     found = rank(anatomy, [replace(design, sizes=tuple(near))]).candidates
     return tuple(sorted(found, key=lambda one: (not one.is_suitable, -one.score))[:count])
-
-
-def _beside(values: Sequence[Value], place: int) -> list[Value]:
-    """Return the values before and after a place."""
-    return [values[k] for k in (place - 1, place + 1) if 0 <= k < len(values)]
-
-
-def _proposed(design: Design, anatomy: Anatomy) -> Size | None:
-    """Return the size of a device that a run proposes; None where none fits."""
-    with suppress(LandingError):
-        return propose_size(design, anatomy)
-    return None
 
 
 def _graded(common: tuple[Anatomy, Criteria], task: tuple[Design, Size, float]) -> Candidate:
@@ -208,7 +188,11 @@ def _graded(common: tuple[Anatomy, Criteria], task: tuple[Design, Size, float]) 
     found = graded_anew(Candidate(design, size, shift_mm, measures, {}, 0.0, False, ""), criteria)
     if not found.is_suitable:
         return found
-    return replace(found, measures=measures | _length_band(anatomy, deployment, measures))
+    band = length_band(anatomy, deployment, measures)
+    if band is not None:
+        measures |= {"deployed_length_low_mm": band.low, "deployed_length_high_mm": band.high}
+        measures |= {"deployed_length_band_cause": next(iter(band.shares))} if band.shares else {}
+    return replace(found, measures=measures)
 
 
 def graded_anew(candidate: Candidate, criteria: Criteria) -> Candidate:
@@ -223,16 +207,7 @@ def graded_anew(candidate: Candidate, criteria: Criteria) -> Candidate:
 
 def ordered(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
     """Return candidates, the best first (see `order_of`)."""
-    return tuple(sorted(candidates, key=lambda candidate: order_of(_row(0, candidate))))
-
-
-def _length_band(anatomy: Anatomy, deployment: Deployment, measures: Measures) -> Measures:
-    """Return the ends of the band of the deployed length and its main cause; empty for a device without ranges."""
-    band = length_band(anatomy, deployment, measures)
-    if band is None:
-        return {}
-    cause: Measures = {"deployed_length_band_cause": next(iter(band.shares))} if band.shares else {}
-    return {"deployed_length_low_mm": band.low, "deployed_length_high_mm": band.high} | cause
+    return tuple(sorted(candidates, key=lambda candidate: order_of(candidate.row)))
 
 
 def landing_measures(anatomy: Anatomy, measures: Measures) -> Measures:
@@ -266,13 +241,11 @@ def _reason(asked: Sequence[Criterion], grades: dict[str, float], measures: Meas
         return "None of the criteria could be measured."
     weight = sum(item.weight for item in asked)
     said = {item.key: item.phrase.format(measures[item.key]) for item in asked}
-    out = [said[item.key] for item in asked if grades[item.key] == 0]
+    out = [said[key] for key in said if grades[key] == 0]
     if out:
         return f"Ruled out: {'; '.join(out)}."
     lost = {item.key: item.weight * (1 - grades[item.key]) / weight for item in asked}
     costly = sorted((key for key in lost if lost[key] > TELLING), key=lambda key: -lost[key])[:TOLD]
-    if costly:
-        return (
-            f"Largest deductions from a score of 1: {'; '.join(f'{said[key]} (-{lost[key]:.2f})' for key in costly)}."
-        )
-    return "Meets almost every criterion in full."
+    if not costly:
+        return "Meets almost every criterion in full."
+    return f"Largest deductions from a score of 1: {'; '.join(f'{said[key]} (-{lost[key]:.2f})' for key in costly)}."

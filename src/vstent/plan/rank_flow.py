@@ -30,8 +30,6 @@ REDUCED: Final = {
     "mean_sac_wss_Pa": "sac_wss_change_fraction",
 }
 """Index of a flow, and the measure of its change against the flow without a device."""
-
-
 RETENTION: Final = "contrast_retention_change_fraction"
 """Measure of the change of the retention of contrast in the sac against the flow without a device."""
 CONTRAST: Final = AngiogramSettings(window_s=10.0, is_preview=True)
@@ -70,19 +68,16 @@ def rank_flows(
     similar fraction with metal, or without a device where none is `SIMILAR`. The start changes a result within its
     uncertainty only. An interrupted ranking, whose flows start from others, gives the same numbers within that.
 
+    Of the candidates, in the same order, those with a flow have its changes, its uncertainty and its grade among their
+    measures, and a sentence on it among their reasons. With contrast, those with a retention have new scores and are
+    ordered among the places that they have.
+
     Parameters
     ----------
-    anatomy : the restored artery, with a sac.
-    ranking : the ranking by geometry.
-    settings : settings of the flows.
     count : number of candidates that get a flow.
     has_contrast : whether contrast is carried through the flows, and its retention in the sac counts in the scores.
     stored : finished results by candidate; those that are there are not computed again, and new ones are added.
     progress : called with the number of finished flows, the number of all, and the name of the next.
-
-    Returns the same candidates in the same order; those with a flow have its changes, its uncertainty and its grade
-    among their measures, and a sentence on it among their reasons. With contrast, those with a retention have new
-    scores and are ordered among the places that they have.
 
     Raises
     ------
@@ -109,17 +104,12 @@ def rank_flows(
             if result is None or candidate in unfinished or (candidate is None and unfinished):
                 waiting[candidate] = background.begin(partial(_stored, found, candidate, flows.computed(candidate)))
             else:
-                waiting[candidate] = partial(_itself, result)
+                waiting[candidate] = partial(dict, result)
     results = {candidate: wait() for candidate, wait in waiting.items()}
     told = [
         _with_flow(one, results[None], results[one], criteria) if one in results else one for one in ranking.candidates
     ]
     return replace(ranking, candidates=tuple(_by_retention(told)))
-
-
-def _itself(result: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return a result."""
-    return result
 
 
 def _stored(found: Stored, candidate: Candidate | None, measured: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
@@ -153,12 +143,7 @@ def chosen_of(ranking: Ranking, count: int) -> list[Candidate]:
 class _Flows:
     """Flows in one vessel, each started from the nearest one. Flows from which none of the others starts are dropped.
 
-    Parameters
-    ----------
-    anatomy : the artery.
-    settings : settings of the flows.
-    has_contrast : whether the retention of contrast is measured.
-    coming : coverages of the neck by the devices, in the order in which they are computed.
+    The devices, in the order in which they are computed, cover the neck by the fractions `coming`.
     """
 
     def __init__(self, anatomy: Anatomy, settings: FlowSettings, has_contrast: bool, coming: list[float]) -> None:
@@ -193,24 +178,10 @@ def flow_with(
     similar: FlowField | None,
     has_contrast: bool,
 ) -> tuple[FlowField | None, Callable[[], Mapping[str, Any]]]:
-    """Compute the flow with one candidate and return it with a function that measures what a ranking keeps of it.
+    """Compute the flow with one candidate, and return it with a function that measures what a ranking keeps of it.
 
-    Parameters
-    ----------
-    anatomy : the restored artery, with a sac.
-    candidate : the candidate; None: no device.
-    settings : settings of the flow.
-    start : the flow without a device.
-    similar : the flow with a similar device.
-    has_contrast : whether the retention of contrast is measured.
-
-    Returns the flow, and a function that returns its results; None and a function that returns an error message where
-    the flow with a device cannot be computed.
-
-    Raises
-    ------
-    FlowError
-        The flow without a device cannot be computed.
+    It starts from the flow with a `similar` device, or from that without one, `start`. Where the flow with a device
+    cannot be computed, it is None, and the function returns an error message; without a device a FlowError is raised.
     """
     case = flow_case(anatomy, () if candidate is None else (stent_of(anatomy, candidate),), settings)
     try:
@@ -218,7 +189,7 @@ def flow_with(
     except FlowError as error:
         if candidate is None:
             raise
-        return None, partial(_itself, {"error": str(error)})
+        return None, partial(dict, {"error": str(error)})
     return field, partial(_measured, anatomy if has_contrast else None, case, field)
 
 

@@ -78,8 +78,7 @@ class Reduced:
     @cached_property
     def landing(self) -> Landing:
         """Where the middle row lies; it stays there."""
-        rows_mm = self.deployment.stent.row_abscissa_mm
-        return Landing(float(rows_mm[(len(rows_mm) - 1) // 2]))
+        return Landing(self.deployment.stent.middle_abscissa_mm)
 
     def results(self, measures: Measures, devices: Iterable[tuple[Design, Size]]) -> dict[str, Floats]:
         """Return the measured results (n,) by name, changed as the model changes with other devices."""

@@ -9,7 +9,6 @@ the same study gives the same result.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -139,24 +138,12 @@ def vary(
     progress: Callable[[int, int], None] | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Uncertainty:
-    """Repeat a deployment with its causes varied.
+    """Repeat a deployment with its causes varied: artery, position of the middle row, size and numbers of the device.
 
-    Parameters
-    ----------
-    deployment : the deployed device. Its size and the position of its middle row are varied.
-    ranges : range of each cause and number of samples.
-    flow : settings of the flow for the first ``ranges.flow_samples`` samples.
-    progress : called with the number of finished samples and the number of all.
-    checkpoint : storage for the samples whose flow is computed; an interrupted study resumes after the last of them.
-
-    Returns results of all samples.
-
-    Raises
-    ------
-    InputError
-        The range of the threshold would close the artery, or that of the device is too large for its diameter.
-    FlowError
-        A flow cannot be computed.
+    The first ``ranges.flow_samples`` samples are computed with a flow of these settings and stored in `checkpoint`, so
+    that an interrupted study resumes after the last of them. `progress` is called with the number of finished samples
+    and the number of all. An InputError says that the range of the threshold would close the artery, or that of the
+    device is too large for its diameter.
     """
     spread, numbers = ranges.of(anatomy), ranges.numbers_of(deployment.stent.design)
     points = centered_points(len(CAUSES) + len(numbers), ranges.samples)
@@ -164,21 +151,24 @@ def vary(
         raise InputError(
             f"diameters that vary by {spread[0]:.2g} mm would close the artery: give a smaller range of the threshold"
         )
-    stent = deployment.stent
-    free_mm = stent.size.free_diameter_mm
+    free_mm = deployment.stent.size.free_diameter_mm
     if ranges.device_mm >= WIDEST_FRACTION * free_mm:
         raise InputError(
             f"a device with a free diameter of {free_mm:.2f} mm is not made {ranges.device_mm:g} mm wider or "
             f"narrower: give a range below {WIDEST_FRACTION * free_mm:.2f} mm"
         )
-    middle_mm = float(stent.row_abscissa_mm[(len(stent.row_abscissa_mm) - 1) // 2])
-    rows = []
+    rows: list[Mapping[str, Floats]] = []
     for number, point in enumerate(points):
         wanted = flow if number < ranges.flow_samples else None
-        made = values_at(numbers, point[len(CAUSES) :])
-        sample = partial(_sample, anatomy, stent, middle_mm, point[: len(CAUSES)] * spread, made, wanted)
-        # a sample without a flow is computed faster than it is read back
-        rows.append(sample() if wanted is None or checkpoint is None else _once(sample, checkpoint, f"sample-{number}"))
+        store = checkpoint if wanted is not None else None  # others are computed faster than they are read back
+        stored = None if store is None else store.load(f"sample-{number}")
+        if stored is None:
+            made = values_at(numbers, point[len(CAUSES) :])
+            sample = _sample(anatomy, deployment.stent, point[: len(CAUSES)] * spread, made, wanted)
+            stored = {result: np.array(value) for result, value in sample.items()}
+            if store is not None:
+                store.save(f"sample-{number}", stored)
+        rows.append(stored)
         if progress is not None:
             progress(number + 1, len(points))
     names = tuple(name for name in (*RESULTS, *FLOW_RESULTS) if any(name in row for row in rows))
@@ -202,23 +192,8 @@ def made_wider(design: Design, size: Size, by_mm: float) -> Size:
     )
 
 
-def _once(sample: Callable[[], dict[str, float]], checkpoint: Checkpoint, name: str) -> dict[str, float]:
-    """Return the results of a sample: stored ones if there are any, otherwise computed and then stored."""
-    kept = checkpoint.load(name)
-    if kept is not None:
-        return {result: float(value) for result, value in kept.items()}
-    found = sample()
-    checkpoint.save(name, {result: np.array(value) for result, value in found.items()})
-    return found
-
-
 def _sample(
-    anatomy: Anatomy,
-    stent: Stent,
-    middle_mm: float,
-    offset: Floats,
-    made: Mapping[str, float],
-    flow: FlowSettings | None,
+    anatomy: Anatomy, stent: Stent, offset: Floats, made: Mapping[str, float], flow: FlowSettings | None
 ) -> dict[str, float]:
     """Return the results with causes changed by `offset` (4,) and numbers `made`; empty if the device does not fit."""
     diameter_mm, along_mm, wider_mm, inflow_fraction = (float(value) for value in offset)
@@ -226,22 +201,17 @@ def _sample(
     try:
         design, size = altered(stent.design, stent.size, made)
         size = made_wider(design, size, wider_mm)
-        deployed = deploy(design, other, size=size, landing=Landing(middle_mm + along_mm))
+        deployed = deploy(design, other, size=size, landing=Landing(stent.middle_abscissa_mm + along_mm))
     except (DeviceError, LandingError):
         return {}
     measures = measure(other, deployed)
     found: dict[str, float] = {name: float(measures[name]) for name in RESULTS if name in measures}
     if flow is None or not other.aneurysms:
         return found
-    inflow_mL_s = flow_case(anatomy, (), flow).inflow_mL_s * (1 + inflow_fraction)
-    return found | _flow_ratios(other, deployed.stent, replace(flow, inflow_mL_s=inflow_mL_s))
-
-
-def _flow_ratios(anatomy: Anatomy, stent: Stent, flow: FlowSettings) -> dict[str, float]:
-    """Return the ratios of the flow with to the flow without the device."""
-    sac = anatomy.aneurysms[0]
-    shapes = sac.sac, ostium(sac, anatomy.vessel.lumen), surfaces_beside(sac, anatomy.vessel.lumen)
-    bare = simulate_case(flow_case(anatomy, (), flow))
-    after = simulate_case(flow_case(anatomy, (stent,), flow), start=bare)
-    found = ratios(indices(bare, *shapes), indices(after, *shapes))
-    return {name: found[name] for name in FLOW_RESULTS if name in found}
+    flow = replace(flow, inflow_mL_s=flow_case(anatomy, (), flow).inflow_mL_s * (1 + inflow_fraction))
+    sac, lumen = other.aneurysms[0], other.vessel.lumen
+    shapes = sac.sac, ostium(sac, lumen), surfaces_beside(sac, lumen)
+    bare = simulate_case(flow_case(other, (), flow))
+    after = simulate_case(flow_case(other, (deployed.stent,), flow), start=bare)
+    changes = ratios(indices(bare, *shapes), indices(after, *shapes))
+    return found | {name: changes[name] for name in FLOW_RESULTS if name in changes}

@@ -4,6 +4,7 @@ Processes are used instead of threads because compiled kernels that run in paral
 """
 
 import multiprocessing
+import os
 import pickle
 import shutil
 import signal
@@ -25,23 +26,13 @@ _SHARED: Final[dict[str, Any]] = {}
 
 
 def spread(
-    work: Callable[[Any, Item], Answer], common: Any, items: Sequence[Item], *, jobs: int = 1
+    work: Callable[[Any, Item], Answer], common: Any, items: Sequence[Item], *, jobs: int = 1, niceness: int = 0
 ) -> Iterator[Answer]:
-    """Yield ``work(common, item)`` for every item, in order.
+    """Yield ``work(common, item)`` for every item, in order; `work` is a function at the top level of a module.
 
-    Parameters
-    ----------
-    work : function at the top level of a module.
-    common : object; data that all items need, sent to every process once.
-    items : sequence; items to work on.
-    jobs : number of processes; with 1 the work is done in this process.
-
-    Yields result for each item.
-
-    Raises
-    ------
-    VstentError
-        A worker process ended unexpectedly.
+    The data that all items need, `common`, are sent to each of the `jobs` processes once. With one job the work is done
+    in this process. Other processes yield to more urgent ones by their `niceness`. A VstentError says that a process
+    ended unexpectedly.
     """
     if jobs <= 1 or len(items) <= 1:
         yield from (work(common, item) for item in items)
@@ -56,7 +47,7 @@ def spread(
         path = folder / "common.pickle"
         path.write_bytes(pickle.dumps((work, common)))
         with spawning():
-            pool = ProcessPoolExecutor(min(jobs, len(items)), context, _start, (path,))
+            pool = ProcessPoolExecutor(min(jobs, len(items)), context, _start, (path, niceness))
             answers = pool.map(_answer, items)
         try:
             yield from answers
@@ -70,12 +61,14 @@ def spread(
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _start(path: Path) -> None:
+def _start(path: Path, niceness: int) -> None:
     """Store the function and the common data in a new worker process."""
     import numba
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles Ctrl-C
     numba.set_num_threads(1)
+    if hasattr(os, "nice"):  # not on Windows
+        os.nice(niceness)
     work, common = pickle.loads(path.read_bytes())
     _SHARED.update(work=work, common=common)
 

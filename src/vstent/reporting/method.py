@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from vstent.anatomy.landing_zones import neck_span_mm
-from vstent.deployment.sketch import bed, sketch
+from vstent.deployment.sketch import measured_wall, sketch
 from vstent.devices.design import Design, Size, widest_mm
 from vstent.devices.stent import Deployment, Landing, Stent, tube_faces
 from vstent.devices.treatment import BARE
@@ -117,7 +117,7 @@ def free_device(design: Design, size: Size) -> Stent:
     is_restored = np.zeros(len(wall.vertices_mm), dtype=bool)
     parent = Path(PARENT, axis, axis.inscribed_radius_mm, wall, is_restored)
     tube = Anatomy(Vessel(wall, ends, (axis,)), (parent,), ())
-    return sketch(bed(design, size, tube), Landing(0.5 * length_mm)).stent
+    return sketch(measured_wall(design, size, tube), Landing(0.5 * length_mm)).stent
 
 
 def wire_layer(stent: Stent) -> LineLayer:

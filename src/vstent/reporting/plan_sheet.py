@@ -8,7 +8,7 @@ import numpy as np
 
 from vstent.anatomy.landing_zones import ZONE_MM, neck_span_mm
 from vstent.deployment.method import laid_inside
-from vstent.deployment.sketch import bed, sketch
+from vstent.deployment.sketch import measured_wall, sketch
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import LandingError
 from vstent.geometry.vessel import Anatomy
@@ -155,9 +155,10 @@ def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str,
 def _length(anatomy: Anatomy, deployment: Deployment) -> str:
     """Return the deployed length with its range."""
     stent = deployment.stent
-    middle_mm = float(stent.row_abscissa_mm[(len(stent.row_abscissa_mm) - 1) // 2])
     try:
-        found = laid_inside(partial(sketch, bed(stent.design, stent.size, anatomy)), Landing(middle_mm))
+        found = laid_inside(
+            partial(sketch, measured_wall(stent.design, stent.size, anatomy)), Landing(stent.middle_abscissa_mm)
+        )
     except LandingError:
         return f"{stent.deployed_length_mm:.1f} mm"
     lengths = sorted(b - a for a, b in zip(found.proximal_band_mm, found.distal_band_mm, strict=True))
