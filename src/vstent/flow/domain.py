@@ -243,13 +243,10 @@ def _connected(
 
 
 def extend(vessel: Vessel) -> tuple[Surface, Ints, tuple[Floats, ...]]:
-    """Add a straight extension with the section's own shape to every opening and close its end.
+    """Return the lumen closed, with a straight extension of the section's own shape at every opening.
 
-    Returns
-    -------
-    surface : closed surface.
-    face_patch : (m,); patch of every face: 0 wall, k + 1 the end of opening k.
-    sections : tuple of (j, 3); for every opening the polygon of its end, in mm.
+    Patches of its faces (m,) are 0 for the wall and k + 1 for the end of opening k; sections are the polygons (j, 3)
+    of these ends in mm.
     """
     lumen, obstacles = vessel.lumen, [vessel.closed]
     vertices, faces = [lumen.vertices_mm], [lumen.faces]

@@ -107,15 +107,10 @@ def simulate_case(
 ) -> FlowField:
     """Compute one flow: steady, or pulsatile if the settings contain a waveform.
 
-    Parameters
-    ----------
-    case : the flow to compute.
-    start : flow in the same vessel without a stent, to start from.
-    similar : flow in the same vessel with a similar stent, to start from instead, if it is steady in a refined sac
-        too; no first guess is then computed.
-    folder : folder for the files of an engine that works with files, also used to resume; None: they are deleted.
-    progress : called at every check; an exception that it raises ends the run.
-    checkpoint : storage for unfinished runs, from which the same flow resumes with an identical result to the last bit.
+    It starts from that in the same vessel without a stent, or from one with a similar stent, if that is steady in a
+    refined sac too; no first guess is then computed. An engine that works with files resumes from those in its folder;
+    without one they are deleted. `progress` is called at every check; an exception that it raises ends the run. From
+    a checkpoint the same flow resumes with an identical result to the last bit.
     """
     with nullcontext(folder) if folder is not None else TemporaryDirectory(prefix="vstent-") as own:
         return _Runs(_engine_of(case), Path(own), progress, checkpoint, similar).answer(case, start)

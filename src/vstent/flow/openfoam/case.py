@@ -27,8 +27,6 @@ class FoamCase:
 
     files: dict[str, str]
     """Text of every file by its path relative to the case folder."""
-    executable: tuple[str, ...]
-    """Paths of the files that are scripts."""
     application: str
     """Name of the solver program."""
 
@@ -105,4 +103,4 @@ def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
     }
     files |= {f"constant/{name}": text for name, text in control.fluid(case.blood, setup).items()}
     files |= {f"{dialect.surfaces}/{name}.stl": stl_text(solids, M_PER_MM) for name, solids in surfaces.items()}
-    return FoamCase(files, SCRIPTS, application)
+    return FoamCase(files, application)

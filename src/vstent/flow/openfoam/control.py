@@ -8,7 +8,7 @@ import numpy as np
 from vstent.flow.case import PHASES, FlowCase
 from vstent.flow.openfoam.dictionary import foam_file
 from vstent.flow.openfoam.mesh import NECK
-from vstent.flow.openfoam.setup import ITERATIONS, FoamSetup
+from vstent.flow.openfoam.setup import CHECK_ITERATIONS, ITERATIONS, FoamSetup
 from vstent.flow.settings import Blood
 from vstent.kernels.arrays import Floats
 from vstent.units import M_PER_MM
@@ -101,7 +101,7 @@ def control(case: FlowCase, setup: FoamSetup, walls: Sequence[str]) -> str:
             ],
         }
     if waveform is None:
-        every = {"writeControl": "timeStep", "writeInterval": 50, "purgeWrite": 2}
+        every = {"writeControl": "timeStep", "writeInterval": CHECK_ITERATIONS, "purgeWrite": 2}
         times = {"endTime": ITERATIONS, "deltaT": 1, **every}
     else:
         times = {

@@ -21,12 +21,10 @@ from vstent.flow.openfoam import program, results
 from vstent.flow.openfoam.bridge import Bridge, Snapshot, bridge, read
 from vstent.flow.openfoam.case import foam_case, strut_solids
 from vstent.flow.openfoam.cost import memory_bytes, tell_cost
-from vstent.flow.openfoam.setup import ITERATIONS, FoamSetup
+from vstent.flow.openfoam.setup import CHECK_ITERATIONS, ITERATIONS, FoamSetup
 from vstent.flow.stopping import cycle_change, cycles_advice, quantities_left
 from vstent.kernels.arrays import Floats, Ints
 
-CHECK_ITERATIONS: Final = 50
-"""Number of iterations of a steady flow between checks."""
 CHECKS_AVERAGED: Final = 8
 """Number of last checks that are averaged if a steady flow does not converge."""
 CHECKS_HELD: Final = 3
@@ -134,7 +132,7 @@ class OpenFoam(AbstractEngine[State]):
         began, phase_s = perf_counter(), state.phase_s
         reached = float((results.times(state.folder) or ["0"])[-1])
         end = reached + CHECK_ITERATIONS if phase_s is None else (round(reached / phase_s) + 1) * phase_s
-        folders.stop_at(state.folder, end, every=CHECK_ITERATIONS if phase_s is None else None)
+        folders.stop_at(state.folder, end)
         said = program.run(state.found, state.folder, [state.application], processes=state.setup.processes)
         state.loop_seconds += perf_counter() - began
         state.add_check(results.times(state.folder)[-1])

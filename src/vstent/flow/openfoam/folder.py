@@ -11,7 +11,7 @@ import numpy as np
 from vstent.flow import sampling
 from vstent.flow.case import FlowField
 from vstent.flow.openfoam import program, results
-from vstent.flow.openfoam.case import FoamCase
+from vstent.flow.openfoam.case import SCRIPTS, FoamCase
 from vstent.flow.openfoam.dictionary import vector
 from vstent.flow.openfoam.setup import FoamSetup
 from vstent.io.writers import write_text
@@ -31,7 +31,7 @@ def write(folder: Path, foam: FoamCase) -> None:
     """Write the files of a case and make its scripts executable."""
     for name, text in foam.files.items():
         write_text(folder / name, text)
-        (folder / name).chmod(0o755 if name in foam.executable else 0o644)
+        (folder / name).chmod(0o755 if name in SCRIPTS else 0o644)
 
 
 def prepare(folder: Path, foam: FoamCase) -> None:
@@ -87,13 +87,10 @@ def begin_from(folder: Path, start: FlowField) -> None:
             write_text(part / "0" / name, f"{head}{inside}{rest}")
 
 
-def stop_at(folder: Path, end: float, *, every: int | None) -> None:
-    """Set the iteration or time at which the solver stops and writes, and optionally the interval of further output."""
+def stop_at(folder: Path, end: float) -> None:
+    """Set the iteration or time at which the solver stops."""
     path = folder / "system" / "controlDict"
-    text = re.sub(r"endTime .*;", f"endTime         {end:.9g};", path.read_text())
-    if every is not None:
-        text = re.sub(r"writeInterval .*;", f"writeInterval   {every};", text, count=1)
-    write_text(path, text)
+    write_text(path, re.sub(r"endTime .*;", f"endTime         {end:.9g};", path.read_text()))
 
 
 def flow_mL_s(folder: Path, patch: str, time: str) -> float:

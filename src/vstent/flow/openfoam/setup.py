@@ -13,6 +13,8 @@ ACROSS = 2.0
 neck."""
 ITERATIONS = 1000
 """Maximum number of iterations of a steady flow."""
+CHECK_ITERATIONS = 50
+"""Number of iterations of a steady flow between checks, at which its fields are written."""
 
 
 @dataclass(frozen=True, eq=False)
