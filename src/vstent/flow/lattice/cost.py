@@ -88,10 +88,7 @@ def estimate(case: FlowCase) -> Cost:
 def refuse_too_large(case: FlowCase, free_bytes: float | None = None, gpu_bytes: float | None = None) -> None:
     """Check that a flow fits in the free memory, in the GPU's memory if it runs there, and in 32-bit addresses.
 
-    Raises
-    ------
-    FlowError
-        When it does not fit; the message names the grid spacing that would.
+    Otherwise raise a `FlowError` that names the grid spacing that would fit.
     """
     free_bytes = free_memory_bytes() if free_bytes is None else free_bytes
     cell_size_mm = default_cell_size_mm(case)
