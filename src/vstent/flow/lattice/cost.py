@@ -154,7 +154,7 @@ def _steps(case: FlowCase, cell_size_mm: float, share: float) -> int:
 
 
 @cache
-def block_rate(*, on_gpu: bool = False) -> float:
+def block_rate(*, on_gpu: bool) -> float:
     """Return the cell updates per second in a block of blood without walls, measured once on the CPU or the GPU."""
     keep_flow()
     length = np.full(BLOCK_ROWS, 64, np.int32)
