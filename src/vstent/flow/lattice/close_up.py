@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from vstent.errors import FlowError
 from vstent.flow import domain as domains
 from vstent.flow import sampling
-from vstent.flow.case import FlowCase, FlowField, Level, Phase
+from vstent.flow.case import FlowCase, FlowField, Phase
 from vstent.flow.domain import BEYOND, Domain, Window
 from vstent.geometry.surface import Surface
 from vstent.kernels import sampling as lattice_sampling
@@ -123,7 +123,15 @@ def close_up(case: FlowCase, outer: FlowField) -> CloseUp:
     """Choose the refined region of a case inside a flow in the whole vessel; without a sac raise a `FlowError`."""
     surface, _, sections = domains.extend(case.vessel)
     grid = outer.finest
-    graph = _neighbours(grid, surface)
+    # The distances, mm, between neighbouring cells that are not separated by the wall.
+    neighbour = grid.neighbours()
+    is_open = neighbour >= 0
+    is_open[:, 0::2] = False  # count every pair once
+    is_open[domains.septa(surface, neighbour, grid)] = False
+    cell, direction = np.nonzero(is_open)
+    length_mm = grid.cell_size_mm * np.linalg.norm(VELOCITIES, axis=1)[direction]
+    places = cell, neighbour[cell, direction]
+    graph = csr_matrix(coo_matrix((length_mm, places), shape=(len(grid.cells),) * 2))
     sac = sampling.cells_inside(require_sac(case), grid.centers_mm, grid.cell_size_mm)
     distance_mm = dijkstra(graph, directed=False, indices=sac, min_only=True)
     diameter_mm = domains.mean_diameter_mm(case.vessel)
@@ -153,18 +161,6 @@ def _parts(graph: csr_matrix, is_beyond: Bools, ends: Ints) -> Ints:
     part[beyond] = connected_components(graph[beyond][:, beyond], directed=False)[1]
     through = np.unique(part[ends][part[ends] >= 0])
     return np.where(np.isin(part, through), np.searchsorted(through, part), -1).astype(np.int32)
-
-
-def _neighbours(grid: Level, surface: Surface) -> csr_matrix:
-    """Return the distances, mm, between neighbouring cells that are not separated by the wall."""
-    neighbour = grid.neighbours()
-    is_open = neighbour >= 0
-    is_open[:, 0::2] = False  # count every pair once
-    is_open[domains.septa(surface, neighbour, grid)] = False
-    cell, direction = np.nonzero(is_open)
-    length_mm = grid.cell_size_mm * np.linalg.norm(VELOCITIES, axis=1)[direction]
-    places = cell, neighbour[cell, direction]
-    return csr_matrix(coo_matrix((length_mm, places), shape=(len(grid.cells),) * 2))
 
 
 def build(case: FlowCase, cell_size_mm: float, chosen: CloseUp) -> Domain:

@@ -88,10 +88,7 @@ def estimate(case: FlowCase) -> Cost:
 def refuse_too_large(case: FlowCase, free_bytes: float | None = None, gpu_bytes: float | None = None) -> None:
     """Check that a flow fits in the free memory, in the GPU's memory if it runs there, and in 32-bit addresses.
 
-    Raises
-    ------
-    FlowError
-        When it does not fit; the message names the grid spacing that would.
+    Otherwise raise a `FlowError` that names the grid spacing that would fit.
     """
     free_bytes = free_memory_bytes() if free_bytes is None else free_bytes
     cell_size_mm = default_cell_size_mm(case)
@@ -157,7 +154,7 @@ def _steps(case: FlowCase, cell_size_mm: float, share: float) -> int:
 
 
 @cache
-def block_rate(*, on_gpu: bool = False) -> float:
+def block_rate(*, on_gpu: bool) -> float:
     """Return the cell updates per second in a block of blood without walls, measured once on the CPU or the GPU."""
     keep_flow()
     length = np.full(BLOCK_ROWS, 64, np.int32)

@@ -50,13 +50,7 @@ class AbstractLattice(AbstractEngine[State]):
     runs_on_gpu: ClassVar[bool] = True
 
     def cost(self, case: FlowCase) -> str:
-        """Return a sentence with the grid spacing, the memory and the run time of a case.
-
-        Raises
-        ------
-        FlowError
-            When the GPU is requested but not usable, or the case does not fit in memory.
-        """
+        """Return a sentence with grid spacing, memory and run time of a case; refuse it if it cannot run."""
         if case.numerics.device_gpu:
             require_gpu()
         refuse_too_large(case)

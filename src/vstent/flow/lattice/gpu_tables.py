@@ -111,7 +111,7 @@ def _layout(state: State) -> Layout:
         kernels.COUNT: np.diff(links.start),
         kernels.DONE: np.zeros(len(links.start) - 1, np.int32),
         kernels.SEPTA: a.septa,
-        kernels.ADDRESS: links.address.T,  # neighbouring threads read neighbouring links
+        kernels.ADDRESS: np.ascontiguousarray(links.address.T),  # neighbouring threads read neighbouring links
         kernels.SLOT: np.where(is_near, -1 - slot, slot)[ends:],
         kernels.FIRST_LINK: refill.groups[0],
         kernels.GROUP_LINK: refill.groups[1],

@@ -82,6 +82,15 @@ def field_of(
     domain, vessel = state.domain, state.case.vessel
     section_Pa = domains.section_pressure_Pa(vessel, domain, flow.pressure_Pa)
     inlet_Pa, outlet_Pa = vessel.of_inlets_and_outlets(section_Pa)
+    # Where the grid is too coarse: for the vessel, unless this is a refined region, or for the flow.
+    too_coarse = ""
+    if state.close_up is None:
+        too_coarse = domains.too_narrow(state.case, domain.cell_size_mm)
+        too_coarse += domains.unreached(vessel, domain)
+    is_vessel = np.repeat(state.limit, state.addressing.length) == CELL_REYNOLDS
+    moments_m_s = [phase.velocity_m_s[0] for phase in phases] or [flow.velocity_m_s]
+    speed_m_s = np.max([np.linalg.norm(one, axis=1) for one in moments_m_s], axis=0)
+    too_coarse += domains.too_fast(domain, np.where(is_vessel, speed_m_s, 0.0), state.case.blood, CELL_REYNOLDS)
     on_gpu = "" if state.device is None else f" Time steps were launched on the GPU {state.device.how}."
     field = FlowField(
         levels=(Level.of(domain, flow.velocity_m_s, flow.pressure_Pa, flow.mean_speed_m_s),),
@@ -95,7 +104,7 @@ def field_of(
         blood=state.case.blood,
         is_converged=outcome.is_converged,
         unsettled_fraction=left,
-        advice=advice + on_gpu + _of_the_grid(state, flow, phases),
+        advice=advice + on_gpu + too_coarse,
         residual=np.array(outcome.residual),
         steps=state.steps,
         seconds=outcome.seconds,
@@ -105,15 +114,3 @@ def field_of(
         neck_inflow_mL_s=flow.neck_inflow_mL_s,
     )
     return field if state.close_up is None else close_ups.assembled(state.close_up, field)
-
-
-def _of_the_grid(state: State, flow: Reading, phases: tuple[Phase, ...]) -> str:
-    """Return sentences on where the grid is too coarse, for the vessel (not in a refined region) or for the flow."""
-    narrow = ""
-    if state.close_up is None:
-        narrow = domains.too_narrow(state.case, state.domain.cell_size_mm)
-        narrow += domains.unreached(state.case.vessel, state.domain)
-    is_vessel = np.repeat(state.limit, state.addressing.length) == CELL_REYNOLDS
-    moments_m_s = [phase.velocity_m_s[0] for phase in phases] or [flow.velocity_m_s]
-    speed_m_s = np.max([np.linalg.norm(one, axis=1) for one in moments_m_s], axis=0)
-    return narrow + domains.too_fast(state.domain, np.where(is_vessel, speed_m_s, 0.0), state.case.blood, CELL_REYNOLDS)

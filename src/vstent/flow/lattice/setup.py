@@ -127,7 +127,6 @@ class Links:
 
     patch: Ints
     """(k,) patch number of every end (see `Domain.link_patch`)."""
-
     address: Ints
     """(l, 6) addresses of the populations at every link (see `d3q19.paths`)."""
     path: Ints

@@ -48,7 +48,8 @@ def build(
     """Set up a run: grid, memory layout, walls, openings, screen and initial flow.
 
     `check_s` is the time between checks and `pace` (m,) the even numbers of time steps from each to the next, repeated
-    cyclically. The last `kept` checks are kept. Without a `start` the run begins at rest.
+    cyclically. The last `kept` checks are kept. Without a `start` the run begins at rest; a pulse begins with the last
+    phase of `start`, if it has phases.
     """
     if case.numerics.device_gpu:
         require_gpu()
@@ -80,8 +81,18 @@ def build(
         check_s=check_s,
         snapshots=deque(maxlen=kept),
     )
-    if start is not None:
-        _begin_from(state, start)
+    if start is None:
+        return state
+    pulses = case.waveform is not None and start.phases
+    velocity_m_s, pressure_Pa = sampling.values_at(
+        start.at_phase(start.phases[-1]) if pulses else start, domain.centers_mm
+    )
+    f, stride = state.populations, addressing.stride
+    density, velocity = pressure_Pa / scales.pressure_Pa, velocity_m_s / scales.speed_m_s
+    d3q19.set_equilibrium(f, stride, addressing.place, density, velocity)
+    for k in np.flatnonzero(links.is_inflow):
+        moments = d3q19.moments(f, stride, links.place[links.start[k] : links.start[k + 1]])
+        links.openings[k, d3q19.MEMORY] = moments[:, 0].mean()
     return state
 
 
@@ -102,25 +113,6 @@ def _grid(case: FlowCase, cell_size_mm: float, close_up: CloseUp | None) -> Grid
         limit = thickest(case, domain)
         built[cell_size_mm] = Grid(domain, limit, address(domain, limit))
     return built[cell_size_mm]
-
-
-def _begin_from(state: State, start: FlowField) -> None:
-    """Set the initial flow; a pulse starts from the last phase of `start`, if it has phases."""
-    pulses = state.case.waveform is not None and start.phases
-    moment = start.at_phase(start.phases[-1]) if pulses else start
-    velocity, pressure = sampling.values_at(moment, state.domain.centers_mm)
-    d3q19.set_equilibrium(
-        state.populations,
-        state.addressing.stride,
-        state.addressing.place,
-        pressure / state.scales.pressure_Pa,
-        velocity / state.scales.speed_m_s,
-    )
-    links = state.links
-    for k in np.flatnonzero(links.is_inflow):
-        at_inlet = links.place[links.start[k] : links.start[k + 1]]
-        moments = d3q19.moments(state.populations, state.addressing.stride, at_inlet)
-        links.openings[k, d3q19.MEMORY] = moments[:, 0].mean()
 
 
 def exchange(state: State, case: FlowCase) -> None:

@@ -20,14 +20,7 @@ import numpy as np
 from numba import config, cuda, njit
 
 from vstent.flow.lattice.kernels import d3q19
-from vstent.flow.lattice.kernels.collision import (
-    collided,
-    collided_screened,
-    relaxed,
-    rescaled,
-    stress_size,
-    thinned,
-)
+from vstent.flow.lattice.kernels.collision import collided, collided_screened, relaxed, rescaled, stress_size, thinned
 from vstent.flow.lattice.kernels.d3q19 import INFLOW, KIND, OPENING, OPPOSITE, PRESSURE, WANTED
 
 THREADS: Final = 8 if config.ENABLE_CUDASIM else 128

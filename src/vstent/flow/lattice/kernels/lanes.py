@@ -88,6 +88,17 @@ _on_pairs(operator.truediv, lambda builder, x, y: builder.fdiv(x, y, flags=_FAST
 _on_pairs(larger, lambda builder, x, y: builder.select(builder.fcmp_ordered(">", x, y), x, y), _larger_number)
 
 
+def _on_one(function: Callable[..., Any], of_lanes: Callable[..., Any], of_number: Callable[..., Any]) -> None:
+    """Make numba apply a function to Lanes or to a number."""
+
+    @overload(function)
+    def chosen(a: Any) -> Any:
+        def on_lanes(a: Any) -> Any:
+            return of_lanes(a)
+
+        return on_lanes if a == LANES else of_number
+
+
 @intrinsic
 def _root(_: Any, a: Any) -> Any:
     """Return the square root of Lanes, element by element."""
@@ -104,17 +115,12 @@ def root(a: Any) -> Any:
     return np.sqrt(a)
 
 
-@overload(root)
-def _root_chosen(a: Any) -> Any:
-    """Return the implementation of `root` for Lanes or for a number."""
+def _root_of_number(a: Any) -> Any:
+    """Return the square root of a number; numpy's is not available on a GPU."""
+    return math.sqrt(a)
 
-    def of_lanes(a: Any) -> Any:
-        return _root(a)
 
-    def of_number(a: Any) -> Any:
-        return math.sqrt(a)  # numpy's is not available on a GPU
-
-    return of_lanes if a == LANES else of_number
+_on_one(root, _root, _root_of_number)
 
 
 @intrinsic
@@ -136,17 +142,7 @@ def any_positive(a: Any) -> Any:
     return a > 0
 
 
-@overload(any_positive)
-def _any_positive_chosen(a: Any) -> Any:
-    """Return the implementation of `any_positive` for Lanes or for a number."""
-
-    def of_lanes(a: Any) -> Any:
-        return _any_positive(a)
-
-    def of_number(a: Any) -> Any:
-        return a > 0
-
-    return of_lanes if a == LANES else of_number
+_on_one(any_positive, _any_positive, any_positive)
 
 
 def _at(context: Any, builder: Any, array: Any, value: Any, place: Any) -> Any:
