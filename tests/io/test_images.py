@@ -8,6 +8,7 @@ import numpy as np
 import pydicom
 import pytest
 import SimpleITK
+from faults import scan
 from scipy.spatial.transform import Rotation
 
 from vstent.anatomy.segment import segment
@@ -1136,3 +1137,61 @@ def test_real_raw_scan(shared_data):
     i, j, k = np.ogrid[:256, :256, :256]
     in_sac = (i - 110) ** 2 + (j - 106) ** 2 + (k - 160) ** 2 < 9**2
     assert np.mean(image.voxels[in_sac] > 120) > 0.98
+
+
+@pytest.mark.parametrize("given", [".img", ".hdr"])
+@pytest.mark.parametrize("is_analyze", [False, True])
+def test_a_pair_of_header_and_voxels_is_read_from_either_file(tmp_path, given, is_analyze):
+    from nibabel import Nifti1Pair, Spm99AnalyzeImage
+
+    affine = np.array([[-0.3, 0, 0, 4], [0, -0.4, 0, 5], [0, 0, 0.5, 6], [0, 0, 0, 1.0]])  # RAS
+    kind = Spm99AnalyzeImage if is_analyze else Nifti1Pair
+    kind(np.asarray(scan().voxels, dtype=np.int16), affine).to_filename(tmp_path / "a.img")
+    (tmp_path / "a.mat").unlink(missing_ok=True)
+    image = read_image(tmp_path / f"a{given}")
+    np.testing.assert_array_equal(image.voxels, scan().voxels)
+    np.testing.assert_allclose(image.spacing_mm, [0.3, 0.4, 0.5], rtol=1e-6)
+    assert image.is_oriented is not is_analyze
+    assert len(image.notes) == is_analyze
+    if not is_analyze:
+        np.testing.assert_allclose(image.affine_mm, np.diag([-1, -1, 1, 1]) @ affine, atol=1e-6)
+    assert set(files_of(tmp_path / f"a{given}")) == {tmp_path / "a.hdr", tmp_path / "a.img"}
+    (tmp_path / "a.img").write_bytes((tmp_path / "a.img").read_bytes()[:-1])
+    with pytest.raises(ReadError, match="breaks off"):
+        read_image(tmp_path / f"a{given}")
+    (tmp_path / f"a{'.hdr' if given == '.img' else '.img'}").unlink()
+    with pytest.raises(ReadError, match="does not exist"):
+        read_image(tmp_path / f"a{given}")
+
+
+@pytest.mark.parametrize("is_even", [True, False])
+@pytest.mark.parametrize("suffix", [".vtr", ".vtk"])
+def test_rectilinear_grids_with_even_steps_are_scans(tmp_path, suffix, is_even):
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonDataModel import vtkRectilinearGrid
+    from vtkmodules.vtkIOLegacy import vtkRectilinearGridWriter
+    from vtkmodules.vtkIOXML import vtkXMLRectilinearGridWriter
+
+    voxels, data = np.asarray(scan().voxels), vtkRectilinearGrid()
+    data.SetDimensions(voxels.shape)
+    places = [
+        first + step * np.arange(n) for first, step, n in zip((1, 2, 3), (0.3, 0.4, 0.5), voxels.shape, strict=True)
+    ]
+    if not is_even:
+        places[1][3] += 0.01
+    for put, values in zip((data.SetXCoordinates, data.SetYCoordinates, data.SetZCoordinates), places, strict=True):
+        put(numpy_to_vtk(values, deep=True))
+    data.GetPointData().SetScalars(numpy_to_vtk(voxels.ravel(order="F"), deep=True))
+    writer = (vtkXMLRectilinearGridWriter if suffix == ".vtr" else vtkRectilinearGridWriter)()
+    writer.SetInputData(data)
+    writer.SetFileName(str(tmp_path / f"a{suffix}"))
+    writer.Write()
+    if not is_even:
+        with pytest.raises(ReadError, match="uneven spacing"):
+            read_image(tmp_path / f"a{suffix}")
+        return
+    image = read_image(tmp_path / f"a{suffix}")
+    np.testing.assert_array_equal(image.voxels, voxels)
+    np.testing.assert_allclose(
+        image.affine_mm, [[0.3, 0, 0, 1], [0, 0.4, 0, 2], [0, 0, 0.5, 3], [0, 0, 0, 1]], atol=1e-6
+    )

@@ -240,3 +240,11 @@ def test_in_a_bend_bands_are_those_of_128_full_deployments(key):
     ratios = compared(key, 128)
     assert ratios["deployed_length_mm"] == pytest.approx(1.0, abs=0.2)
     assert max(ratios.values()) < 2.0
+
+
+@pytest.mark.parametrize(("dimensions", "samples"), [(1, 1), (5, 16), (7, 100), (24, 128), (25, 8), (3, 200)])
+def test_points_are_those_of_scipys_sobol_sequence_whether_stored_or_not(dimensions, samples):
+    from scipy.stats.qmc import Sobol
+
+    unit = Sobol(dimensions, scramble=False).random_base2(int(np.ceil(np.log2(samples))))
+    np.testing.assert_array_equal(centered_points(dimensions, samples), 2 * (unit + 0.5 / len(unit)) - 1)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vstent.errors import VstentError
-from vstent.io.files import NIFTI_SUFFIXES, suffix
+from vstent.io.files import NIFTI_SUFFIXES, PAIR_SUFFIXES, suffix
 from vstent.io.scans import read_scan
 from vstent.io.text_headers import META_SUFFIXES, NRRD_SUFFIXES
 from vstent.io.vtk_reader import read_mesh
@@ -89,9 +89,9 @@ def _save(path: Path, values: NDArray[Any]) -> None:
 
 def _libraries(what: str, path: Path) -> tuple[str, ...]:
     """Return the libraries that the reader of a file imports: loading them from a slow disk is no part of reading."""
-    if what == "mesh" or suffix(path) in (".vti", ".vtk"):
+    if what == "mesh" or suffix(path) in (".vti", ".vtr", ".vtk"):
         return ("vtkmodules.vtkIOGeometry", "vtkmodules.vtkIOLegacy", "vtkmodules.vtkIOPLY", "vtkmodules.vtkIOXML")
-    if suffix(path) in NIFTI_SUFFIXES:
+    if suffix(path) in (*NIFTI_SUFFIXES, *PAIR_SUFFIXES):
         return ("nibabel.nifti2",)
     return ("SimpleITK",) if suffix(path) in (*NRRD_SUFFIXES, *META_SUFFIXES) else ("pydicom",)
 

@@ -22,7 +22,12 @@ NIFTI_SUFFIXES: Final = (".nii", ".nii.gz")
 """Suffixes of NIfTI files."""
 RAW_SUFFIXES: Final = (".raw", ".raw.gz")
 """Suffixes of voxels without a header; their number and spacing must be given."""
-IMAGE_SUFFIXES: Final = (*NIFTI_SUFFIXES, ".nrrd", ".nhdr", ".mha", ".mhd", ".vti", *RAW_SUFFIXES, ".dcm")
+PAIR_SUFFIXES: Final = (".hdr", ".img")
+"""Suffixes of the header and of the voxels of a NIfTI or Analyze image of two files."""
+IMAGE_SUFFIXES: Final = (
+    *(*NIFTI_SUFFIXES, *PAIR_SUFFIXES, ".nrrd", ".nhdr", ".mha", ".mhd"),
+    *(".vti", ".vtr", *RAW_SUFFIXES, ".dcm"),
+)
 """Suffixes of scans."""
 CACHE: Final = ".vstent"
 """Subfolder by which a folder of results is recognized; it holds the finished stages."""

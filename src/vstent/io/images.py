@@ -11,6 +11,7 @@ from vstent.geometry.image import Image
 from vstent.io import dicom
 from vstent.io.apart import read_apart
 from vstent.io.files import existing, is_surface_file
+from vstent.io.nifti import pair_of
 from vstent.io.text_headers import voxel_files
 
 
@@ -26,7 +27,8 @@ def read_image(
 
     Parameters
     ----------
-    path : DICOM folder or file, NIfTI, NRRD, MHA, MHD, VTI, legacy VTK image or raw (also .gz).
+    path : DICOM folder or file, NIfTI or Analyze (also as .hdr and .img), NRRD, MHA, MHD, VTI, VTR, legacy VTK image
+        or raw (also .gz).
     spacing_mm : voxel edges along i, j, k, or one number for cubes. Required for raw voxels and for headers without
         spacing; it replaces the spacing in the header.
     shape : number of voxels along i, j, k of raw voxels; i runs fastest.
@@ -70,4 +72,7 @@ def files_of(path: Path) -> list[Path]:
         return [path]
     if dicom.is_dicom(path):
         return dicom.series_of(path)
-    return [path, *(file for file in voxel_files(path) if os.path.isfile(file))]  # accepts too long names
+    return [
+        *dict.fromkeys(pair_of(path)),
+        *(file for file in voxel_files(path) if os.path.isfile(file)),
+    ]  # accepts too long names

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from vstent.errors import ReadError, UnitError
 from vstent.geometry.image import Image
-from vstent.io.files import DAMAGE, unpacked
+from vstent.io.files import DAMAGE, PAIR_SUFFIXES, existing, suffix, unpacked
 from vstent.io.limits import MOST_BYTES, refuse_torn
 from vstent.kernels.arrays import Floats
 
@@ -24,13 +24,18 @@ RAS_TO_LPS: Final = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 def read_nifti(path: Path, *, has_spacing: bool) -> Image:
-    """Read one volume from a NIfTI-1 or NIfTI-2 file.
+    """Read one volume from a NIfTI-1 or NIfTI-2 file, or from a pair of header (``.hdr``) and voxels (``.img``).
 
     Scaled integers (``scl_slope``, ``scl_inter``) are returned as scaled values. The frame is the sform where its code
-    is set, else the qform. Where neither is set, the voxel axes are taken as LPS axes.
+    is set, else the qform. Where neither is set, the voxel axes are taken as LPS axes; they have no orientation in
+    an Analyze file.
     """
-    header = _header(path)
-    stored = _stored(header, path)
+    head, body = pair_of(path)
+    header = _header(existing(head))
+    is_analyze = head != body and bytes(header["magic"])[:2] != b"ni"
+    if is_analyze:  # it has other fields in the places of these
+        header["sform_code"] = header["qform_code"] = header["xyzt_units"] = header["scl_slope"] = 0
+    stored = _stored(header, existing(body), 0 if head != body else int(header["sizeof_hdr"]))
     spacing = np.abs(np.array(header["pixdim"][1:4], dtype=np.float64))
     if not has_spacing and not (np.isfinite(spacing).all() and (spacing > 0).all()):
         raise UnitError(f"{path.name} does not state a voxel spacing above zero; give --spacing in mm.")
@@ -45,7 +50,18 @@ def read_nifti(path: Path, *, has_spacing: bool) -> Image:
     intercept = intercept if np.isfinite(intercept) else 0.0
     is_scaled = slope != 0.0 and np.isfinite(slope) and (slope, intercept) != (1.0, 0.0)  # as NIfTI-1.1 defines
     voxels = (stored * slope + intercept).astype(np.float32) if is_scaled else stored
-    return Image(voxels, to_mm @ affine, notes=notes)
+    if is_analyze:
+        notes = ("Analyze files state no orientation: left, right, front and back are unknown.",)
+    return Image(voxels, to_mm @ affine, notes=notes, is_oriented=not is_analyze)
+
+
+def pair_of(path: Path) -> tuple[Path, Path]:
+    """Return the files of header and voxels, which are one file unless the suffix is ``.hdr`` or ``.img``."""
+    if suffix(path) not in PAIR_SUFFIXES:
+        return path, path
+    names = ((path.with_suffix(kind), path.with_suffix(kind.upper())) for kind in PAIR_SUFFIXES)
+    head, body = (next((file for file in pair if file.is_file()), pair[0]) for pair in names)
+    return head, body
 
 
 def _header(path: Path) -> Any:
@@ -72,8 +88,8 @@ def _header(path: Path) -> Any:
         raise ReadError(f"{path.name} is damaged: its header contradicts itself. Copy or export it again.") from None
 
 
-def _stored(header: Any, path: Path) -> NDArray[Any]:
-    """Return the voxels (i, j, k) as stored."""
+def _stored(header: Any, path: Path, least: int) -> NDArray[Any]:
+    """Return the voxels (i, j, k) as stored, which begin at byte `least` or later."""
     from nibabel.nifti1 import data_type_codes
     from nibabel.spatialimages import HeaderDataError
 
@@ -99,7 +115,7 @@ def _stored(header: Any, path: Path) -> NDArray[Any]:
         raise ReadError(f"{path.name}: voxels of type {kind} are not supported. Export one value per voxel.")
     n_bytes, begin = math.prod(sizes) * kind.itemsize, float(header["vox_offset"])
     refuse_torn(announced, n_bytes, path.stat().st_size)
-    if not int(header["sizeof_hdr"]) <= begin <= MOST_BYTES:
+    if not least <= begin <= MOST_BYTES:
         raise ReadError(f"{path.name} is damaged: its voxels would begin at byte {begin:g}. Copy or export it again.")
     try:
         with unpacked(path) as file:

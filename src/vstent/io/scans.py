@@ -15,6 +15,7 @@ from vstent.io.files import (
     DAMAGE,
     IMAGE_SUFFIXES,
     NIFTI_SUFFIXES,
+    PAIR_SUFFIXES,
     RAW_SUFFIXES,
     existing,
     is_vtk_image,
@@ -47,9 +48,9 @@ def read_scan(
         image = dicom.read_dicom(path, has_spacing=has_spacing, acquisition=acquisition)
     elif kind in RAW_SUFFIXES:
         image = _read_raw(path, shape, dtype, has_spacing=has_spacing)
-    elif kind in NIFTI_SUFFIXES:
+    elif kind in (*NIFTI_SUFFIXES, *PAIR_SUFFIXES):
         image = read_nifti(path, has_spacing=has_spacing)
-    elif kind == ".vti" or is_vtk_image(path):
+    elif kind in (".vti", ".vtr") or is_vtk_image(path):
         image = read_vtk_image(path, has_spacing=has_spacing)
     elif kind in IMAGE_SUFFIXES:
         image = read_itk(path, has_spacing=has_spacing)

@@ -21,6 +21,8 @@ LEAST_USED: Final = 0.9
 
 Points come before triangles, so a truncated file has a smaller fraction.
 """
+UNEVEN: Final = 1e-3
+"""Largest deviation of a step of a rectilinear grid, as a fraction of the mean step."""
 HEAD_BYTES: Final = 1 << 16
 """Number of bytes that hold the header of a file."""
 _SPACING: Final = re.compile(
@@ -83,14 +85,10 @@ def read_mesh(path: Path) -> Mesh:
 
 
 def read_vtk_image(path: Path, *, has_spacing: bool) -> Image:
-    """Read a VTK image (``.vti``, or ``.vtk`` of structured points); its axes are taken as LPS."""
+    """Read an image or a rectilinear grid with even steps (``.vti``, ``.vtr``, ``.vtk``); its axes are taken as LPS."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     data = _loaded(path)
-    if data is not None and data.IsA("vtkRectilinearGrid"):
-        raise ReadError(
-            f"{path.name} is a rectilinear grid, which vstent does not read. Export it as structured points."
-        )
     scalars = None if data is None else data.GetPointData().GetScalars() or data.GetPointData().GetArray(0)
     if scalars is None or scalars.GetNumberOfComponents() != 1:
         raise ReadError(
@@ -99,13 +97,23 @@ def read_vtk_image(path: Path, *, has_spacing: bool) -> Image:
     shape = data.GetDimensions()
     voxels = vtk_to_numpy(scalars).reshape(shape, order="F")
     refuse_bomb(f"{path.name} holds {' x '.join(map(str, shape))} voxels", voxels.nbytes, path.stat().st_size)
+    affine = np.eye(4)
+    if data.IsA("vtkRectilinearGrid"):
+        for axis, array in enumerate((data.GetXCoordinates(), data.GetYCoordinates(), data.GetZCoordinates())):
+            places = vtk_to_numpy(array).astype(np.float64)
+            steps = np.diff(places)
+            if not len(steps) or not np.abs(steps - steps.mean()).max() <= UNEVEN * abs(steps.mean()):
+                raise ReadError(
+                    f"{path.name} is a grid with uneven spacing. Resample it to one spacing along each axis."
+                )
+            affine[axis, axis], affine[axis, 3] = steps.mean(), places[0]
+        return Image(voxels, affine)
     with path.open("rb") as file:
         stated = _SPACING.search(file.read(HEAD_BYTES))
     if not has_spacing and not (stated and are_lengths((stated[1] or stated[2]).split())):
         raise UnitError(f"{path.name} does not state a voxel spacing above zero; give --spacing in mm.")
     matrix = data.GetDirectionMatrix()
     direction = np.array([[matrix.GetElement(row, column) for column in range(3)] for row in range(3)])
-    affine = np.eye(4)
     affine[:3, :3] = direction * np.array(data.GetSpacing())
     affine[:3, 3] = np.array(data.GetOrigin()) + affine[:3, :3] @ np.array(data.GetExtent()[::2], dtype=np.float64)
     return Image(voxels, affine)
@@ -122,6 +130,7 @@ def _loaded(path: Path) -> Any:
         ".vtu": vtkIOXML.vtkXMLUnstructuredGridReader,
         ".vtm": vtkIOXML.vtkXMLMultiBlockDataReader,
         ".vti": vtkIOXML.vtkXMLImageDataReader,
+        ".vtr": vtkIOXML.vtkXMLRectilinearGridReader,
         ".vtk": vtkIOLegacy.vtkGenericDataObjectReader,
         ".ply": vtkIOPLY.vtkPLYReader,
         ".stl": vtkIOGeometry.vtkSTLReader,

@@ -160,9 +160,10 @@ def _solve(matrix: Any, right: Any) -> None:
         right[i, :] /= matrix[i, i]
 
 
+# Arithmetic on small arrays in a parallel function takes seconds to compile.
 @njit(cache=True)
 def _tangents(x: float, y: float, z: float) -> Any:
-    """Return two unit tangents, as three numbers each, of a unit normal."""
+    """Return two unit tangents, of three numbers each, of a unit normal."""
     if abs(x) <= abs(y) and abs(x) <= abs(z):
         u, v, w = 0.0, z, -y
     elif abs(y) <= abs(z):
@@ -172,58 +173,6 @@ def _tangents(x: float, y: float, z: float) -> Any:
     length = np.sqrt(u * u + v * v + w * w)
     u, v, w = u / length, v / length, w / length
     return (u, v, w), (y * w - z * v, z * u - x * w, x * v - y * u)
-
-
-@njit(cache=True)
-def _floor(x: float) -> int:
-    """Return the largest whole number up to a number."""
-    return int(np.floor(x))
-
-
-# A parallel function compiles slowly, so that it has only the loop.
-@njit(cache=True)
-def _fit_at(
-    index: Any, distance: Any, velocity: Any, pressure: Any, p: Any, normal: Any, reach: int, result: Any
-) -> None:
-    """Store the fit of `fit_wall` at one wall point."""
-    first, second = _tangents(normal[0], normal[1], normal[2])
-    shear, level = np.zeros((5, 5)), np.zeros((4, 4))
-    shear_right, level_right = np.zeros((5, 3)), np.zeros((4, 1))
-    base = np.zeros(5)
-    i_low, j_low, k_low = _floor(p[0]) - reach + 1, _floor(p[1]) - reach + 1, _floor(p[2]) - reach + 1
-    for i in range(i_low, i_low + 2 * reach):
-        for j in range(j_low, j_low + 2 * reach):
-            for k in range(k_low, k_low + 2 * reach):
-                cell = _cell_at(index, i, j, k)
-                if cell < 0:
-                    continue
-                x, y, z = i - p[0], j - p[1], k - p[2]
-                away = x * x + y * y + z * z
-                inward = x * normal[0] + y * normal[1] + z * normal[2]
-                if away >= reach * reach or inward < -0.2 * reach:
-                    continue
-                d = distance[cell]
-                weight = (1.0 - away / (reach * reach)) ** 2
-                base[0], base[1] = 1.0, d
-                base[2] = x * first[0] + y * first[1] + z * first[2]
-                base[3] = x * second[0] + y * second[1] + z * second[2]
-                base[4] = d * d
-                for a in range(4):
-                    for b in range(4):
-                        level[a, b] += weight * base[a] * base[b]
-                    level_right[a, 0] += weight * base[a] * pressure[cell]
-                for a in range(5):
-                    for b in range(5):
-                        shear[a, b] += weight * d * d * base[a] * base[b]
-                    for axis in range(3):
-                        shear_right[a, axis] += weight * d * base[a] * velocity[cell, axis]
-    if level[0, 0] <= 0.0:
-        return
-    _solve(shear, shear_right)
-    _solve(level, level_right)
-    for axis in range(3):
-        result[axis] = shear_right[0, axis]
-    result[3] = level_right[0, 0]
 
 
 @njit(cache=True, parallel=True, nogil=True)
@@ -240,5 +189,43 @@ def fit_wall(index: Any, distance: Any, velocity: Any, pressure: Any, points: An
     """
     result = np.zeros((len(points), 4))
     for m in prange(len(points)):
-        _fit_at(index, distance, velocity, pressure, points[m], normals[m], reach, result[m])
+        p, normal = points[m], normals[m]
+        first, second = _tangents(normal[0], normal[1], normal[2])
+        shear, level = np.zeros((5, 5)), np.zeros((4, 4))
+        shear_right, level_right = np.zeros((5, 3)), np.zeros((4, 1))
+        base = np.zeros(5)
+        lowest = np.floor(p).astype(np.int64) - reach + 1
+        for i in range(lowest[0], lowest[0] + 2 * reach):
+            for j in range(lowest[1], lowest[1] + 2 * reach):
+                for k in range(lowest[2], lowest[2] + 2 * reach):
+                    cell = _cell_at(index, i, j, k)
+                    if cell < 0:
+                        continue
+                    x, y, z = i - p[0], j - p[1], k - p[2]
+                    away = x * x + y * y + z * z
+                    inward = x * normal[0] + y * normal[1] + z * normal[2]
+                    if away >= reach * reach or inward < -0.2 * reach:
+                        continue
+                    d = distance[cell]
+                    weight = (1.0 - away / (reach * reach)) ** 2
+                    base[0], base[1] = 1.0, d
+                    base[2] = x * first[0] + y * first[1] + z * first[2]
+                    base[3] = x * second[0] + y * second[1] + z * second[2]
+                    base[4] = d * d
+                    for a in range(4):
+                        for b in range(4):
+                            level[a, b] += weight * base[a] * base[b]
+                        level_right[a, 0] += weight * base[a] * pressure[cell]
+                    for a in range(5):
+                        for b in range(5):
+                            shear[a, b] += weight * d * d * base[a] * base[b]
+                        for axis in range(3):
+                            shear_right[a, axis] += weight * d * base[a] * velocity[cell, axis]
+        if level[0, 0] <= 0.0:
+            continue
+        _solve(shear, shear_right)
+        _solve(level, level_right)
+        for axis in range(3):
+            result[m, axis] = shear_right[0, axis]
+        result[m, 3] = level_right[0, 0]
     return result
