@@ -76,7 +76,10 @@ def _sac(aneurysm: Aneurysm, wall: _Shift, tube: _Shift) -> Aneurysm:
     """Return an aneurysm moved with the wall (sac, section by the neck plane) and the landing surface (neck)."""
     plane = aneurysm.plane
     if plane is not None:
-        moved = replace(plane, rim_mm=wall(plane.rim_mm))
+        rim_mm = wall(plane.rim_mm)
+        height_mm = rim_mm @ plane.normal
+        # The section stays plane where the wall leans differently around it.
+        moved = replace(plane, rim_mm=rim_mm - np.outer(height_mm - height_mm.mean(), plane.normal))
         factor = moved.area_mm2 / plane.area_mm2
         low_mm2, high_mm2 = plane.area_band_mm2
         plane = replace(moved, area_band_mm2=(factor * low_mm2, factor * high_mm2))
