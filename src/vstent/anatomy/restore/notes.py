@@ -5,10 +5,10 @@ from typing import Final
 
 import numpy as np
 
+from vstent.anatomy.morphology import beyond_plane
 from vstent.anatomy.restore.bulges import Bulge
 from vstent.anatomy.restore.path import PASSING, is_off_sacs, reach_of
 from vstent.anatomy.restore.sac import is_in_one
-from vstent.anatomy.shape import beyond_plane
 from vstent.anatomy.trace import parent_radius_mm
 from vstent.geometry.vessel import Aneurysm, Candidate, Centerline, Vessel
 from vstent.kernels import curves
