@@ -9,6 +9,7 @@ from vstent import phantoms
 from vstent.anatomy.restore.bulges import find_bulges
 from vstent.anatomy.restore.plane import plane_sac
 from vstent.anatomy.restore.tubes import tubes_of
+from vstent.flow.indices import _beyond_mm3
 from vstent.flow.ostium import SHIFT_MM, opening, ostium, surfaces_beside
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Aneurysm
@@ -65,3 +66,18 @@ def test_a_sac_without_a_plane_is_entered_through_its_opening(lumen, aneurysm) -
     np.testing.assert_array_equal(ostium(drawn, lumen).vertices_mm, opening(drawn, lumen).vertices_mm)
     assert ostium(drawn, lumen).area_mm2 == pytest.approx(aneurysm.neck.area_mm2, rel=1e-3)
     assert surfaces_beside(drawn, lumen) == {}
+
+
+def test_the_turnover_time_is_that_of_the_volume_beyond_the_neck_plane(lumen, aneurysm) -> None:
+    surface = ostium(aneurysm, lumen)
+    assert _beyond_mm3(aneurysm.sac, surface) == pytest.approx(aneurysm.sac.volume_mm3, rel=1e-4)
+    # Of a sac that reaches 0.5 mm farther down, as one closed by the artery's wall may, as much counts.
+    low = aneurysm.sac.vertices_mm.copy()
+    on_neck = np.abs((low - aneurysm.plane.center_mm) @ aneurysm.plane.normal) < 1e-6
+    low[on_neck] -= SHIFT_MM * aneurysm.plane.normal
+    lower = Surface(low, aneurysm.sac.faces)
+    assert lower.volume_mm3 > aneurysm.sac.volume_mm3 + 0.4 * SHIFT_MM * surface.area_mm2
+    assert _beyond_mm3(lower, surface) == pytest.approx(aneurysm.sac.volume_mm3, rel=0.01)
+    assert _beyond_mm3(lower, aneurysm.neck) == pytest.approx(aneurysm.sac.volume_mm3, rel=0.01)
+    curved = Surface(surface.vertices_mm + 0.2 * np.sin(surface.vertices_mm[:, 2:]), surface.faces)
+    assert _beyond_mm3(lower, curved) == lower.volume_mm3
