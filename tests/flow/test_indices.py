@@ -188,3 +188,12 @@ def test_compared_flows_have_both_values_and_their_ratio() -> None:
     assert found["inlet_2_flow_mL_s"][:2] == (0.0, 2.0)
     assert np.isnan(found["inlet_2_flow_mL_s"].ratio)
     assert "neck_inflow_mL_s" not in found
+
+
+def test_further_surfaces_have_their_inflow_scaled_as_that_of_the_neck_is() -> None:
+    steady, half = flow(through_neck(0.05, 0.05)), {"below": plate(NECK_HALF_MM / 2, 0.2)}
+    found = indices(steady, sac(), plate(NECK_HALF_MM, 0.2), half)
+    assert found["below_mL_s"] == pytest.approx(0.05 * 4 * 3**2 / 2, rel=1e-3)  # in where x > -1 mm, over 4 mm of y
+    told = indices(replace(steady, neck_inflow_mL_s=10.0), sac(), plate(NECK_HALF_MM, 0.2), half)
+    assert told["neck_inflow_mL_s"] == 10.0
+    assert told["below_mL_s"] == pytest.approx(10.0 * found["below_mL_s"] / found["neck_inflow_mL_s"])

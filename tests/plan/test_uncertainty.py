@@ -24,7 +24,7 @@ from vstent.phantoms import demo_phantom, phantom_surface
 from vstent.plan import uncertainty
 from vstent.plan.ranges import Ranges
 from vstent.plan.shares import first_order_shares
-from vstent.plan.uncertainty import CAUSES, vary
+from vstent.plan.uncertainty import CAUSES, Uncertainty, vary
 from vstent.plan.widening import widened
 from vstent.study.folder import CACHE
 from vstent.study.store import Unfinished
@@ -311,3 +311,13 @@ def test_causes_are_checked(words, said, capsys):
     with pytest.raises(SystemExit):
         main(["run", "a.stl", "--out", "out", *words])
     assert said in capsys.readouterr().err
+
+
+def test_the_band_of_the_neck_is_among_the_intervals():
+    from vstent.reporting.uncertainty import intervals
+
+    found = Uncertainty(np.ones(4), np.zeros((2, 4)), ("a_mm",), np.ones((2, 1)), neck_mm2=(10.0, 9.0, 12.0)).metrics()
+    assert found["intervals"]["neck_plane_area_mm2"] == {"mean": 10.0, "low": 9.0, "high": 12.0}
+    row = intervals({"uncertainty": found})[-1]
+    assert (row.mean, row.low, row.high) == ("10.0\u202fmm²", "9.00\u202fmm²", "12.0\u202fmm²")
+    assert row.shares == [("choice of the neck plane", 1.0)]

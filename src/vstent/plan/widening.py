@@ -37,7 +37,11 @@ def widened(anatomy: Anatomy, diameter_mm: float) -> Anatomy:
     for aneurysm in anatomy.aneurysms:
         plane = aneurysm.plane
         if plane is not None:
-            moved = replace(plane, rim_mm=with_wall(plane.rim_mm))
+            section_mm = with_wall(plane.rim_mm)
+            height_mm = section_mm @ plane.normal
+            # The section stays plane where the wall leans differently around it.
+            flat_mm = section_mm - np.outer(height_mm - height_mm.mean(), plane.normal)
+            moved = replace(plane, rim_mm=flat_mm)
             factor = moved.area_mm2 / plane.area_mm2
             low_mm2, high_mm2 = plane.area_band_mm2
             plane = replace(moved, area_band_mm2=(factor * low_mm2, factor * high_mm2))

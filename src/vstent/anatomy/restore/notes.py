@@ -5,6 +5,7 @@ from typing import Final
 
 import numpy as np
 
+from vstent.anatomy.morphology import beyond_plane
 from vstent.anatomy.restore.bulges import Bulge
 from vstent.anatomy.restore.path import PASSING, is_off_sacs, reach_of
 from vstent.anatomy.restore.sac import is_in_one
@@ -22,6 +23,8 @@ NEAR_SAC_MM: Final = 4.0
 UNCERTAIN: Final = 1.25
 """A neck is reported as uncertain where the largest area of nearly as good planes exceeds the smallest by this
 factor."""
+LARGER: Final = 1.3
+"""A neck is reported as uncertain where the sac is larger than its part beyond the neck plane by this factor."""
 WHOLE: Final = 0.7
 """A neck is reported as uncertain where less than this fraction of the bulge's wall is in the sac."""
 STENOSED: Final = 0.7
@@ -75,9 +78,17 @@ def _neck(aneurysm: Aneurysm) -> list[str]:
             "widths and volume by plane refer to the mean plane of its neck curve."
         ]
     low_mm2, high_mm2 = aneurysm.plane.area_band_mm2
-    notes: list[str] = []
     if not np.array_equal(aneurysm.neck_mm, aneurysm.plane.rim_mm):
-        return notes
+        volume_mm3 = aneurysm.sac.volume_mm3
+        beyond_mm3 = beyond_plane(aneurysm, aneurysm.plane.center_mm, aneurysm.plane.normal).volume_mm3
+        if volume_mm3 < LARGER * beyond_mm3:
+            return []
+        return [
+            f"The neck is uncertain: the sac has {volume_mm3:.0f} mm3 down to the wall of the artery, and "
+            f"{beyond_mm3:.0f} mm3 beyond its neck plane, because its flank has no waist. Look at the neck, and draw "
+            "it by hand if it is wrong (--neck)."
+        ]
+    notes = []
     if high_mm2 > UNCERTAIN * low_mm2:
         notes.append(
             f"The neck is uncertain: its area is {aneurysm.plane.area_mm2:.1f} mm2, and {low_mm2:.1f} to "
