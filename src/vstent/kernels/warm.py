@@ -30,7 +30,7 @@ def warm() -> None:
     tiny = tree.build(vertices, faces)
     tree.closest_points(tiny, vertices)
     tree.segments_cross(tiny, vertices, 2 * vertices)
-    sections.beyond(sections.sheet(vertices, faces, vertices), 0, vertices, vertices)
+    sections.beyond(sections.sheet(vertices, faces, np.ones((1, 1))), 0, vertices, vertices)
     tree.inscribed_radii(tree.curved(tiny, triangles.smooth_normals(vertices, faces)[faces]), vertices)
     screen = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [0.0, 1.0, 1.0]])
     depth, image, sums = (np.zeros(shape, np.float32) for shape in ((2, 2), (2, 2, 3), (2, 2, 4)))
