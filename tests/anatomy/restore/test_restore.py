@@ -142,6 +142,9 @@ def test_two_sacs_are_both_found_and_the_one_at_a_point_alone() -> None:
     is_upward = anatomy.parent.axis.points_mm[0, 2] < 1
     found = {round(z if is_upward else 46 - z): one for z, one in zip(middles_mm, anatomy.aneurysms, strict=True)}
     assert list(found) == [30, 15]  # the larger first
+    (note,) = (note for note in anatomy.notes if note.startswith("2 sacs, the largest first: "))
+    for part, phantom in zip(note.split(";")[:2], (second, first), strict=True):
+        np.testing.assert_allclose(place_in(part), phantom.sac.center_mm, atol=1.0)
     for abscissa_mm, phantom in ((15, first), (30, second)):
         np.testing.assert_allclose(found[abscissa_mm].sac.volume_mm3, phantom.sac_volume_mm3, rtol=0.01)
         np.testing.assert_allclose(found[abscissa_mm].neck.area_mm2, phantom.neck_area_mm2, rtol=0.03)

@@ -52,6 +52,13 @@ def told(
     elif len(bulges) > len(aneurysms):
         more = counted(len(bulges) - len(aneurysms), "more bulge")
         notes.append(f"{more} not used: flat, a lobe of a sac, or on another branch.")
+    if len(aneurysms) > 1:
+        places = [(one.sac.volume_mm3, place(one.sac.vertices_mm.mean(axis=0))) for one in aneurysms]
+        listed = "; ".join(f"{volume_mm3:.0f} mm3 at {where}" for volume_mm3, where in places)
+        notes.append(
+            f"{len(aneurysms)} sacs, the largest first: {listed}. Devices and flow refer to the first; choose another "
+            "one by a point in it (--at)."
+        )
     notes += _before_another(vessel, path, bulges)
     notes += _near_sacs(vessel, bulges)
     notes += _from_sacs(vessel, path, aneurysms)
