@@ -43,7 +43,7 @@ def test_the_ostium_is_the_section_by_the_neck_plane_and_bounds_the_sac(lumen, a
 
 def test_half_a_millimetre_into_the_sac_the_section_is_that_of_the_sphere(lumen, aneurysm) -> None:
     beside, plane, sphere = surfaces_beside(aneurysm, lumen), aneurysm.plane, PHANTOM.sac
-    assert set(beside) == {"neck_inflow_in_sac", "neck_inflow_in_artery", "opening_inflow"}
+    assert set(beside) == {"neck_inflow_in_sac", "neck_inflow_in_artery", "plane_inflow", "opening_inflow"}
     down_mm = (sphere.center_mm - plane.center_mm) @ plane.normal - SHIFT_MM
     section_mm2 = np.pi * (sphere.width_radius_mm**2 - down_mm**2)
     assert beside["neck_inflow_in_sac"].area_mm2 == pytest.approx(section_mm2, rel=0.01)
@@ -66,6 +66,16 @@ def test_a_sac_without_a_plane_is_entered_through_its_opening(lumen, aneurysm) -
     np.testing.assert_array_equal(ostium(drawn, lumen).vertices_mm, opening(drawn, lumen).vertices_mm)
     assert ostium(drawn, lumen).area_mm2 == pytest.approx(aneurysm.neck.area_mm2, rel=1e-3)
     assert surfaces_beside(drawn, lumen) == {}
+
+
+@pytest.mark.parametrize(("rises_mm", "is_plane"), [(-0.3, True), (0.05, True), (0.3, False)])
+def test_where_the_wall_of_the_artery_rises_through_the_plane_the_opening_counts(
+    lumen, aneurysm, rises_mm: float, is_plane: bool
+) -> None:
+    neck = Surface(aneurysm.neck.vertices_mm + rises_mm * aneurysm.plane.normal, aneurysm.neck.faces)
+    bent = replace(aneurysm, neck=neck)
+    wanted = surfaces_beside(bent, lumen)["plane_inflow" if is_plane else "opening_inflow"]
+    np.testing.assert_array_equal(ostium(bent, lumen).vertices_mm, wanted.vertices_mm)
 
 
 def test_the_turnover_time_is_that_of_the_volume_beyond_the_neck_plane(lumen, aneurysm) -> None:
