@@ -8,10 +8,9 @@ import numpy as np
 from vstent.flow import sampling
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.domain import mean_diameter_mm
-from vstent.flow.ostium import ostium
+from vstent.flow.ostium import ostium, surfaces_beside
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy, roles
-from vstent.kernels import triangles
 from vstent.kernels.arrays import Bools, Floats
 from vstent.units import M_PER_MM
 
@@ -24,8 +23,6 @@ FAST_M_S = 0.08
 """Speed, m/s, above which blood in a sac counts as part of the inflow jet."""
 NEAR_MM = 10.0
 """Distance from the neck, mm, within which wall belongs to the parent artery (Cebral et al. 2011, AJNR 32, 145)."""
-ON_PLANE: Final = 1e-6
-"""Rounding of the heights above a plane, mm, and of the cosines between its normals."""
 QUANTITIES: Final = (
     "neck_inflow_mL_s",
     "mean_sac_velocity_m_s",
@@ -50,7 +47,7 @@ def indices(
 
     - ``neck_inflow_mL_s`` = integral over the ostium of max(u.n, 0) and ``neck_outflow_mL_s`` of max(-u.n, 0), with
       tricubic interpolation of the velocity; ``inflow_area_fraction`` = part of the ostium where u.n > 0;
-      ``turnover_time_s`` = volume of the sac beyond the ostium / neck inflow; the inflow through every surface of
+      ``turnover_time_s`` = sac volume / neck inflow; the inflow through every surface of
       `beside`, as ``NAME_mL_s``;
     - ``mean_sac_velocity_m_s``, ``max_sac_velocity_m_s``, ``mean_sac_pressure_Pa`` over the sac's cells;
       ``sac_kinetic_energy_J`` = integral of rho u^2 / 2; ``fast_sac_volume_mm3`` where u > 0.08 m/s;
@@ -93,20 +90,9 @@ def indices(
         result[key] = max(values) if key.startswith("max_") else float(np.mean(values))
     # Quotients of means over the cycle: those at single moments are unbounded where the flow is at rest.
     inflow_mL_s, share = result["neck_inflow_mL_s"], result["inflow_area_fraction"]
-    result["turnover_time_s"] = _beyond_mm3(sac, ostium) * 1e-3 / max(inflow_mL_s, 1e-12)
+    result["turnover_time_s"] = abs(sac.volume_mm3) * 1e-3 / max(inflow_mL_s, 1e-12)
     result["inflow_concentration_index"] = inflow_mL_s / field.inflow_mL_s / max(share, 1e-12)
     return result | _of_sac_wall(field, sac, ostium)
-
-
-def _beyond_mm3(sac: Surface, ostium: Surface) -> float:
-    """Return the volume of a sac beyond a plane ostium; the whole volume where the ostium is curved, as the sac is."""
-    normal = ostium.normals[0]
-    if (ostium.normals @ normal).min() < 1 - ON_PLANE:
-        return abs(sac.volume_mm3)
-    below_mm = (ostium.vertices_mm[0] - sac.vertices_mm) @ normal
-    vertices, faces, _ = triangles.clip(sac.vertices_mm, sac.faces, below_mm - ON_PLANE)
-    vertices, faces = triangles.cap(vertices, faces, triangles.boundary_loops(vertices, faces))
-    return abs(triangles.volume(vertices[faces]))
 
 
 def ratios(before: dict[str, float], after: dict[str, float]) -> dict[str, float]:
@@ -144,7 +130,7 @@ def compare(anatomy: Anatomy, before: FlowField, after: FlowField) -> dict[str, 
         aneurysm.
     """
     largest = anatomy.aneurysms[0] if anatomy.aneurysms else None
-    shapes = () if largest is None else (largest.sac, ostium(largest, anatomy.vessel.lumen))
+    shapes = (largest.sac, ostium(largest, anatomy.vessel.lumen), surfaces_beside(largest)) if largest else ()
     first, second = indices(before, *shapes), indices(after, *shapes)
     change = ratios(first, second)
     return {key: Change(first[key], second[key], change.get(f"{key}_ratio", np.nan)) for key in first if key in second}

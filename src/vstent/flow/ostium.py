@@ -13,8 +13,6 @@ from vstent.kernels.arrays import Floats
 
 ON_WALL_MM: Final = 1e-3
 """Distance to the lumen, mm, below which a face of a sac is wall: such faces are cut from the lumen."""
-RISES_MM: Final = 0.1
-"""Height above the neck plane, mm, above which the artery's wall rises through it."""
 SHIFT_MM: Final = 0.5
 """Distance, mm, by which the neck plane is moved to show how much the neck inflow depends on its position."""
 N_AROUND: Final = 96
@@ -26,52 +24,10 @@ N_RINGS: Final = 12
 def ostium(aneurysm: Aneurysm, lumen: Surface) -> Surface:
     """Return the surface at which the neck inflow is counted, with normals into the sac.
 
-    It is the section of the lumen by the neck plane, where the sac begins: it bounds the whole volume beyond that
-    plane, and blood that passes along the artery below it does not cross it. Where the restored wall of the artery
-    rises through that plane, as on the outside of a bend, passing blood and devices are on both sides of it; there,
-    and without a neck plane, it is the opening of the sac's closed surface (`opening`).
-
-    Raises
-    ------
-    FlowError
-        The sac has no opening.
-    """
-    plane = aneurysm.plane
-    if plane is None or ((aneurysm.neck.vertices_mm - plane.center_mm) @ plane.normal).max() > RISES_MM:
-        return opening(aneurysm, lumen)
-    return _flat(plane.rim_mm, plane.normal)
-
-
-def surfaces_beside(aneurysm: Aneurysm, lumen: Surface) -> dict[str, Surface]:
-    """Return further surfaces through which an inflow is stated, by its name; empty for a sac without a neck plane.
-
-    ``neck_inflow_in_sac`` is the section of the sac `SHIFT_MM` beyond the neck plane, ``neck_inflow_in_artery`` the
-    outline of the neck moved as far into the artery, ``plane_inflow`` the section by the neck plane itself, and
-    ``opening_inflow`` the opening of the sac's closed surface, which may be curved and extend along the artery.
-    """
-    plane = aneurysm.plane
-    if plane is None:
-        return {}
-    shift_mm = SHIFT_MM * plane.normal
-    below_mm = SHIFT_MM - (aneurysm.sac.vertices_mm - plane.center_mm) @ plane.normal
-    vertices, faces, _ = triangles.clip(aneurysm.sac.vertices_mm, aneurysm.sac.faces, below_mm)
-    rims_mm = [vertices[loop] for loop in triangles.boundary_loops(vertices, faces)]
-    found = {
-        "neck_inflow_in_artery": _flat(plane.rim_mm - shift_mm, plane.normal),
-        "plane_inflow": _flat(plane.rim_mm, plane.normal),
-        "opening_inflow": opening(aneurysm, lumen),
-    }
-    if not rims_mm:  # a sac lower than the shift
-        return found
-    largest_mm = max(rims_mm, key=lambda rim_mm: abs(triangles.polygon_area_vector(rim_mm) @ plane.normal))
-    return {"neck_inflow_in_sac": _flat(largest_mm, plane.normal)} | found
-
-
-def opening(aneurysm: Aneurysm, lumen: Surface) -> Surface:
-    """Return the part of the sac's closed surface that is not wall, around its neck and with normals into the sac.
-
-    The neck is the part of it on the landing surface. Where the sac's flank was continued to that surface through the
-    blood, blood also passes through the flank; only through both together do inflow and outflow balance.
+    It is the part of the sac's closed surface that is not wall, around its neck: the section by the neck plane where
+    that closes the sac, as at forks, and elsewhere the restored wall of the artery. Where the sac's flank was continued
+    to that wall through the blood, blood also passes through the flank; only through both together do inflow and
+    outflow balance.
 
     Raises
     ------
@@ -87,6 +43,29 @@ def opening(aneurysm: Aneurysm, lumen: Surface) -> Surface:
     middle_mm = aneurysm.neck.vertices_mm[np.argmax(lumen.closest(aneurysm.neck.vertices_mm)[1])]
     vertices, faces = triangles.part_at(sac.vertices_mm, sac.faces[is_open], middle_mm)
     return Surface(vertices, faces[:, ::-1])
+
+
+def surfaces_beside(aneurysm: Aneurysm) -> dict[str, Surface]:
+    """Return further surfaces through which an inflow is stated, by its name; empty for a sac without a neck plane.
+
+    ``neck_inflow_in_sac`` is the section of the sac `SHIFT_MM` beyond the neck plane, ``neck_inflow_in_artery`` the
+    outline of the neck moved as far into the artery, and ``plane_inflow`` the section by the neck plane itself.
+    """
+    plane = aneurysm.plane
+    if plane is None:
+        return {}
+    shift_mm = SHIFT_MM * plane.normal
+    below_mm = SHIFT_MM - (aneurysm.sac.vertices_mm - plane.center_mm) @ plane.normal
+    vertices, faces, _ = triangles.clip(aneurysm.sac.vertices_mm, aneurysm.sac.faces, below_mm)
+    rims_mm = [vertices[loop] for loop in triangles.boundary_loops(vertices, faces)]
+    found = {
+        "neck_inflow_in_artery": _flat(plane.rim_mm - shift_mm, plane.normal),
+        "plane_inflow": _flat(plane.rim_mm, plane.normal),
+    }
+    if not rims_mm:  # a sac lower than the shift
+        return found
+    largest_mm = max(rims_mm, key=lambda rim_mm: abs(triangles.polygon_area_vector(rim_mm) @ plane.normal))
+    return {"neck_inflow_in_sac": _flat(largest_mm, plane.normal)} | found
 
 
 def _flat(rim_mm: Floats, normal: Floats) -> Surface:

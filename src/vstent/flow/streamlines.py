@@ -64,13 +64,14 @@ def _one_way(grid: Level, mouths: Surface, seeds_mm: Floats, step_cells: float) 
     paths, count = lattice_sampling.trace_all(grid.index, grid.velocity_m_s, seeds, step_cells, SLOWEST_M_S, most)
     paths[..., :3] = grid.origin_mm + paths[..., :3] * grid.cell_size_mm
     lines = []
-    for path, n in zip(paths, count, strict=True):
-        step_mm = np.diff(path[:n, :3], axis=0)
+    for whole, n in zip(paths, count, strict=True):
+        path = whole[:n]
+        step_mm = np.diff(path[:, :3], axis=0)
         length_mm = np.linalg.norm(step_mm, axis=1)
         ahead = step_mm / np.maximum(length_mm, 1e-12)[:, None]
-        distance_mm, face = mouths.first_hits(path[: n - 1, :3], ahead)
+        distance_mm, face = mouths.first_hits(path[:-1, :3], ahead)
         leaves = (distance_mm <= length_mm) & (np.einsum("ij,ij->i", mouths.normals[face], ahead) > 0)
-        lines.append(path[: int(np.argmax(leaves)) + 1] if leaves.any() else path[:n])
+        lines.append(path[: int(np.argmax(leaves)) + 1] if leaves.any() else path)
     return lines
 
 

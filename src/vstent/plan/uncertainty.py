@@ -210,7 +210,7 @@ def _sample(
         return found
     flow = replace(flow, inflow_mL_s=flow_case(anatomy, (), flow).inflow_mL_s * (1 + inflow_fraction))
     sac, lumen = other.aneurysms[0], other.vessel.lumen
-    shapes = sac.sac, ostium(sac, lumen), surfaces_beside(sac, lumen)
+    shapes = sac.sac, ostium(sac, lumen), surfaces_beside(sac)
     bare = simulate_case(flow_case(other, (), flow))
     after = simulate_case(flow_case(other, (deployed.stent,), flow), start=bare)
     changes = ratios(indices(bare, *shapes), indices(after, *shapes))

@@ -341,7 +341,7 @@ def measure_study(
     """Return all metrics of a study: of vessel, implants and flows, with bands, uncertainties and failures."""
     sac = anatomy.aneurysms[0] if anatomy.aneurysms else None
     lumen = anatomy.vessel.lumen
-    shapes = (sac.sac, ostium(sac, lumen), surfaces_beside(sac, lumen)) if sac and fields else ()
+    shapes = (sac.sac, ostium(sac, lumen), surfaces_beside(sac)) if sac and fields else ()
     treatments: dict[str, dict[str, Any]] = {BARE: {}} if fields else {}
     for name, deployed in implants.items():
         treatments[name] = {"implants": {id_: measure(anatomy, one) for id_, one in deployed.items()}}
