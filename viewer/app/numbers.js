@@ -94,5 +94,5 @@ export function bandWords(sheet) {
 export function neckWords(neck, found) {
   const row = (name, value, was) => make("div", { className: "row" }, [make("span", {}, [name]), make("b", {}, [value]), make("small", {}, [value === was ? "" : `of the vessel shown: ${was}`])]);
   const [area, around] = [(x) => `${x.area_mm2.toFixed(1)} mm²`, (x) => `${x.perimeter_mm.toFixed(1)} mm`];
-  return [row("Neck area", area(neck), area(found)), row("Neck perimeter", around(neck), around(found))];
+  return [row("Neck curve, projected area", area(neck), area(found)), row("Neck perimeter", around(neck), around(found))];
 }

@@ -14,7 +14,7 @@ FIRST: Final = {
     "anatomy": (
         "sac_volume_mm3",
         "sac_height_mm",
-        "neck_area_mm2",
+        "neck_plane_area_mm2",
         "neck_max_diameter_mm",
         "aspect_ratio",
         "size_ratio",

@@ -40,7 +40,7 @@ def truth(case: CaseResult) -> list[Row]:
     rows.append(("Artery radius, worst place", float(found_mm[worst]), float(true_mm[worst]), "mm"))
     sacs = case.anatomy.aneurysms
     rows.append(("Sac volume", sacs[0].sac.volume_mm3 if sacs else 0.0, phantom.sac_volume_mm3, "mm3"))
-    rows.append(("Neck area", sacs[0].neck.area_mm2 if sacs else 0.0, phantom.neck_area_mm2, "mm2"))
+    rows.append(("Neck surface", sacs[0].neck.area_mm2 if sacs else 0.0, phantom.neck_area_mm2, "mm2"))
     for treatment in case.metrics["treatments"].values():
         for name, measures in treatment.get("implants", {}).items():
             outside_mm = float(measures["max_outside_mm"])
