@@ -99,6 +99,22 @@ def test_a_braid_in_a_wide_artery_stands_off_by_half_of_what_its_free_diameter_l
     assert (gap.low, gap.high) == pytest.approx(wanted, abs=0.01)
 
 
+def test_a_braid_at_its_free_diameter_is_as_long_as_deployed_with_another_one():
+    radius_mm = 2.3
+    (one,) = (one for one in SILK.ranges if one.name == MARGIN)
+    only = replace(SILK, ranges=(one,))
+    deployment, measures = lying(radius_mm)
+    of_margin = replace(deployment, stent=replace(deployment.stent, design=only))
+    length = bands(straight(radius_mm), of_margin, measures).results["deployed_length_mm"]
+    others = [altered(SILK, SIZE, {MARGIN: one.low + share * (one.high - one.low)}) for share in INTERVAL]
+    lengths_mm = [
+        deploy(design, straight(radius_mm), size=size, landing=Landing(MIDDLE_MM)).stent.deployed_length_mm
+        for design, size in others
+    ]
+    assert max(lengths_mm) > 1.05 * min(lengths_mm)
+    assert (length.low, length.high) == pytest.approx(sorted(lengths_mm), rel=0.01)
+
+
 def test_ends_of_an_outer_layer_do_not_move_the_mesh():
     design = find_design("fred")
     size = find_size(design, diameter_mm=4, length_mm=14)
