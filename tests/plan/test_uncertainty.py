@@ -237,7 +237,7 @@ def test_inflow_and_flow_are_varied_where_the_flow_is_asked(monkeypatch):
 
     monkeypatch.setattr(uncertainty, "simulate_case", answer)
     monkeypatch.setattr(uncertainty, "indices", known)
-    monkeypatch.setattr(uncertainty, "ostium", lambda *_: None)
+    monkeypatch.setattr(uncertainty, "sac_surfaces", lambda *_: ())
     monkeypatch.setattr("vstent.flow.problem.ostium", lambda *_: None)
     ranges = Ranges(8, flow_samples=8, threshold_mm=0.0, landing_mm=0.5, device_mm=0.0)
     found = vary(artery(), deployed(), ranges, flow=FlowSettings(inflow_mL_s=4.0))
@@ -259,8 +259,8 @@ def test_a_sample_whose_flow_is_done_is_not_computed_again(monkeypatch, tmp_path
     monkeypatch.setattr(uncertainty, "ratios", ratios)
     monkeypatch.setattr(uncertainty, "simulate_case", lambda case, start=None: case)
     monkeypatch.setattr(uncertainty, "indices", lambda case, *_: case.inflow_mL_s)
-    for module in ("vstent.flow.problem.ostium", "vstent.plan.uncertainty.ostium"):
-        monkeypatch.setattr(module, lambda *_: None)
+    monkeypatch.setattr(uncertainty, "sac_surfaces", lambda *_: ())
+    monkeypatch.setattr("vstent.flow.problem.ostium", lambda *_: None)
     ranges = Ranges(4, flow_samples=4, threshold_mm=0.0, landing_mm=0.5, device_mm=0.0)
     begun, flow = Unfinished(tmp_path, "vary silk-key"), FlowSettings(inflow_mL_s=4.0)
     with pytest.raises(KeyboardInterrupt):

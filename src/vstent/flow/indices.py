@@ -8,7 +8,7 @@ import numpy as np
 from vstent.flow import sampling
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.domain import mean_diameter_mm
-from vstent.flow.ostium import ostium, surfaces_beside
+from vstent.flow.ostium import sac_surfaces
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy, roles
 from vstent.kernels.arrays import Bools, Floats
@@ -129,8 +129,7 @@ def compare(anatomy: Anatomy, before: FlowField, after: FlowField) -> dict[str, 
         Values before and after and their ratio, by the names of `indices`; those of the vessel alone where it has no
         aneurysm.
     """
-    largest = anatomy.aneurysms[0] if anatomy.aneurysms else None
-    shapes = (largest.sac, ostium(largest, anatomy.vessel.lumen), surfaces_beside(largest)) if largest else ()
+    shapes = sac_surfaces(anatomy)
     first, second = indices(before, *shapes), indices(after, *shapes)
     change = ratios(first, second)
     return {key: Change(first[key], second[key], change.get(f"{key}_ratio", np.nan)) for key in first if key in second}

@@ -7,7 +7,7 @@ import numpy as np
 from vstent.devices.stent import tube_faces
 from vstent.errors import FlowError
 from vstent.geometry.surface import Surface
-from vstent.geometry.vessel import Aneurysm
+from vstent.geometry.vessel import Anatomy, Aneurysm
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Floats
 
@@ -16,7 +16,7 @@ ON_WALL_MM: Final = 1e-3
 SHIFT_MM: Final = 0.5
 """Distance, mm, by which the neck plane is moved to show how much the neck inflow depends on its position."""
 N_AROUND: Final = 96
-"""Number of points around a flat ostium; its area is smaller by 0.07 % than that of a circle through them."""
+"""Number of points around the section by a plane; its area is smaller by 0.07 % than that of a circle through them."""
 N_RINGS: Final = 12
 """Number of rings of triangles in it."""
 
@@ -66,6 +66,14 @@ def surfaces_beside(aneurysm: Aneurysm) -> dict[str, Surface]:
         return found
     largest_mm = max(rims_mm, key=lambda rim_mm: abs(triangles.polygon_area_vector(rim_mm) @ plane.normal))
     return {"neck_inflow_in_sac": _flat(largest_mm, plane.normal)} | found
+
+
+def sac_surfaces(anatomy: Anatomy) -> tuple[()] | tuple[Surface, Surface, dict[str, Surface]]:
+    """Return the surfaces of the largest sac that `vstent.indices` takes: sac, ostium and `surfaces_beside`."""
+    if not anatomy.aneurysms:
+        return ()
+    largest = anatomy.aneurysms[0]
+    return largest.sac, ostium(largest, anatomy.vessel.lumen), surfaces_beside(largest)
 
 
 def _flat(rim_mm: Floats, normal: Floats) -> Surface:

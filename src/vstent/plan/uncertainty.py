@@ -20,7 +20,7 @@ from vstent.devices.ranges import altered, values_at
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import DeviceError, InputError, LandingError
 from vstent.flow.indices import indices, ratios
-from vstent.flow.ostium import ostium, surfaces_beside
+from vstent.flow.ostium import sac_surfaces
 from vstent.flow.problem import flow_case
 from vstent.flow.settings import FlowSettings
 from vstent.flow.simulation import Checkpoint, simulate_case
@@ -209,8 +209,7 @@ def _sample(
     if flow is None or not other.aneurysms:
         return found
     flow = replace(flow, inflow_mL_s=flow_case(anatomy, (), flow).inflow_mL_s * (1 + inflow_fraction))
-    sac, lumen = other.aneurysms[0], other.vessel.lumen
-    shapes = sac.sac, ostium(sac, lumen), surfaces_beside(sac)
+    shapes = sac_surfaces(other)
     bare = simulate_case(flow_case(other, (), flow))
     after = simulate_case(flow_case(other, (deployed.stent,), flow), start=bare)
     changes = ratios(indices(bare, *shapes), indices(after, *shapes))

@@ -30,7 +30,7 @@ from vstent.flow.case import FlowField
 from vstent.flow.engines import Progress as FlowProgress
 from vstent.flow.grade import computation_of, grade
 from vstent.flow.indices import indices, ratios
-from vstent.flow.ostium import ostium, surfaces_beside
+from vstent.flow.ostium import sac_surfaces
 from vstent.flow.problem import flow_case, vessel_case
 from vstent.flow.settings import FlowSettings
 from vstent.flow.simulation import foretell_cost, simulate_case
@@ -339,9 +339,7 @@ def measure_study(
     failures: Mapping[str, str],
 ) -> dict[str, Any]:
     """Return all metrics of a study: of vessel, implants and flows, with bands, uncertainties and failures."""
-    sac = anatomy.aneurysms[0] if anatomy.aneurysms else None
-    lumen = anatomy.vessel.lumen
-    shapes = (sac.sac, ostium(sac, lumen), surfaces_beside(sac)) if sac and fields else ()
+    shapes = sac_surfaces(anatomy) if fields else ()
     treatments: dict[str, dict[str, Any]] = {BARE: {}} if fields else {}
     for name, deployed in implants.items():
         treatments[name] = {"implants": {id_: measure(anatomy, one) for id_, one in deployed.items()}}
