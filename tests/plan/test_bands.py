@@ -25,6 +25,8 @@ SILK = find_design("silk")
 ENTERPRISE = find_design("enterprise")
 SIZE = find_size(SILK, diameter_mm=4, length_mm=15)
 RADIUS_MM = 1.9
+WIDE_MM = 2.3
+"""Radius of an artery wider than the device."""
 MIDDLE_MM = 16.0
 
 
@@ -87,28 +89,28 @@ def test_one_uncertain_number_makes_the_whole_band():
     assert (found.low, found.high) == pytest.approx(sorted(lengths), rel=0.01)
 
 
+def at_its_free_diameter():
+    """Range of the free diameter, a deployment of which only that is uncertain, and its measures."""
+    (margin,) = (one for one in SILK.ranges if one.name == MARGIN)
+    deployment, measures = lying(WIDE_MM)
+    stent = replace(deployment.stent, design=replace(SILK, ranges=(margin,)))
+    return margin, replace(deployment, stent=stent), measures
+
+
 def test_a_braid_in_a_wide_artery_stands_off_by_half_of_what_its_free_diameter_lacks():
-    radius_mm = 2.3
-    (one,) = (one for one in SILK.ranges if one.name == MARGIN)
-    only = replace(SILK, ranges=(one,))
-    deployment, measures = lying(radius_mm)
-    of_margin = replace(deployment, stent=replace(deployment.stent, design=only))
-    gap = gap_bands(straight(radius_mm), of_margin, measures)["max_wall_gap_mm"]
-    at = [one.low + share * (one.high - one.low) for share in reversed(INTERVAL)]
-    wanted = [measures["max_wall_gap_mm"] - 0.5 * (value - one.value) for value in at]
+    margin, of_margin, measures = at_its_free_diameter()
+    gap = gap_bands(straight(WIDE_MM), of_margin, measures)["max_wall_gap_mm"]
+    at = [margin.low + share * (margin.high - margin.low) for share in reversed(INTERVAL)]
+    wanted = [measures["max_wall_gap_mm"] - 0.5 * (value - margin.value) for value in at]
     assert (gap.low, gap.high) == pytest.approx(wanted, abs=0.01)
 
 
 def test_a_braid_at_its_free_diameter_is_as_long_as_deployed_with_another_one():
-    radius_mm = 2.3
-    (one,) = (one for one in SILK.ranges if one.name == MARGIN)
-    only = replace(SILK, ranges=(one,))
-    deployment, measures = lying(radius_mm)
-    of_margin = replace(deployment, stent=replace(deployment.stent, design=only))
-    length = bands(straight(radius_mm), of_margin, measures).results["deployed_length_mm"]
-    others = [altered(SILK, SIZE, {MARGIN: one.low + share * (one.high - one.low)}) for share in INTERVAL]
+    margin, of_margin, measures = at_its_free_diameter()
+    length = bands(straight(WIDE_MM), of_margin, measures).results["deployed_length_mm"]
+    others = [altered(SILK, SIZE, {MARGIN: margin.low + share * (margin.high - margin.low)}) for share in INTERVAL]
     lengths_mm = [
-        deploy(design, straight(radius_mm), size=size, landing=Landing(MIDDLE_MM)).stent.deployed_length_mm
+        deploy(design, straight(WIDE_MM), size=size, landing=Landing(MIDDLE_MM)).stent.deployed_length_mm
         for design, size in others
     ]
     assert max(lengths_mm) > 1.05 * min(lengths_mm)

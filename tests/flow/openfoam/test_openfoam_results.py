@@ -289,7 +289,7 @@ def test_of_a_flow_that_does_not_settle_neck_inflow_and_magnitudes_are_the_mean_
     velocity_m_s, stress_Pa = np.zeros((n, 3)), np.zeros((v, 3))
     velocity_m_s[0], stress_Pa[1] = (3, 4, 0), (0, 0, 2)
     one = Snapshot("50", velocity_m_s, np.zeros(n), stress_Pa, np.zeros(v), np.zeros(2), 1.0)
-    # What goes to and fro from check to check is told by its size.
+    # A flow that oscillates from check to check reports the size of its oscillation.
     other = replace(one, velocity_m_s=-velocity_m_s, wall_shear_stress_Pa=-stress_Pa, neck_inflow_mL_s=2.0)
     unused = cast("Any", SimpleNamespace(n_cells=n))
     state = State(
