@@ -127,7 +127,8 @@ def plates(scene: Scene) -> list[Plate]:
     if devices:
         coverage = (
             "Metal coverage: fraction of the contour covered by metal, measured on the wires and averaged over a "
-            "few pores; higher on the inside of a bend, lower on its outside."
+            "few pores. In a bend, wires at more than 45° to the axis (flow diverters) are denser on the inner side, "
+            "and those at less than 45° (laser-cut closed cells) on the outer side."
         )
         wires = (
             "The wires and the neck (red line), seen from the sac with its wall removed; wires on the far side are "
