@@ -16,6 +16,7 @@ from vstent.anatomy.repair import repair
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
+from vstent.deployment import cells
 from vstent.deployment.coverage import coverage_fractions, pore_areas_mm2, quad_areas_mm2
 from vstent.deployment.deploy import deploy
 from vstent.deployment.measure import measure
@@ -26,7 +27,7 @@ from vstent.flow.problem import flow_case
 from vstent.flow.settings import FlowSettings
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.surfaces import read_surface
-from vstent.phantoms import phantom_surface
+from vstent.phantoms import demo_phantom, phantom_surface
 from vstent.units import MM_PER_UM
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
@@ -230,10 +231,36 @@ def enterprise() -> list[Row]:
         net = []
         for first, last in ((0.0, THIRD), (np.pi - THIRD, np.pi)):
             apart = 1 + 0.5 * diameter_mm / bend_mm * np.cos(np.linspace(first, last, 101))
-            turned = 2 * np.arccos(apart * spacing_mm / length_mm)
+            turned = 2 * np.arccos(apart * spacing_mm / length_mm)  # twice the angle between strut and axis
             net.append(np.average(2 * design.strut_width_um * MM_PER_UM / length_mm / np.sin(turned), weights=apart))
         values = [float(measure(artery, done)["metal_coverage_fraction"]), *sides(artery, done, bend_mm), *net]
         rows.append((f"bend of {bend_mm:g} mm radius", *(f"{100 * one:.1f}" for one in values)))
+    return rows
+
+
+def over_neck() -> list[Row]:
+    """Coverage of Enterprise over the neck of the demo, and what it depends on."""
+    anatomy = restore(trim(trace(Vessel(phantom_surface(demo_phantom(), edge_mm=0.2)))))
+    design = catalogue.find_design("enterprise")
+
+    def covered(method: str = "constant_wire", **changes: float) -> str:
+        measures = measure(anatomy, deploy(replace(design, **changes), anatomy, method=method))
+        return f"{100 * float(measures['neck_metal_coverage_fraction']):.1f}"
+
+    done = deploy(design, anatomy)
+    straight = formulas.coverage_fraction(design, done.stent.size, float(done.stent.row_diameter_mm.mean()))
+    rows = [("none", covered()), ("straight artery of the same diameter", f"{100 * straight:.1f}")]
+    rows.append(("struts of 60 µm instead of 78 µm", covered(strut_width_um=60)))
+    rows.append(("10 or 14 instead of 12 struts around", f"{covered(n_columns=10)}, {covered(n_columns=14)}"))
+    angles = ", ".join(covered(cell_angle_rad=float(np.deg2rad(one))) for one in (30, 40))
+    rows.append(("cell angle of 30 or 40 degrees instead of 35", angles))
+    bending, found = cells.BENDING, []
+    for share in (0.25, 0.5, 2.0):
+        cells.BENDING = share * bending
+        found.append(covered())
+    cells.BENDING = bending
+    rows.append(("a quarter, half or twice the weight of bending", ", ".join(found)))
+    rows.append(('struts free to stretch (``method="zhong2016"``)', covered("zhong2016")))
     return rows
 
 
@@ -351,6 +378,7 @@ def main() -> None:
     show("44 24 32", [("measured by others", "published", "vstent"), *rows])
     names = ("Enterprise", "whole device, %", "outer third, %", "inner third, %", "net, outer, %", "net, inner, %")
     show("30 14 14 14 14 14", [names, *enterprise()])
+    show("60 20", [("change", "metal over the neck of the demo, %"), *over_neck()])
     if "--flow" in sys.argv[1:]:
         names = ("vessel and method", "metal over the neck, %", "neck inflow, %", "mean sac velocity, %")
         show("34 22 22 22", [names, *flows()])
