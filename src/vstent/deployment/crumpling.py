@@ -3,7 +3,7 @@
 Struts do not stretch. On the outer side of a bend, cells are drawn out along the artery and narrow around it. Where
 two tight bends follow each other in different directions, as in a siphon, single cells close or turn on edge while
 their neighbours open wide. Cells that are short along the artery, as on the inner side of a bend, are not crumpled:
-there the device is dense but even.
+they keep their width.
 """
 
 from functools import lru_cache
