@@ -2,7 +2,7 @@
 
 Usage: python benchmarks/screen.py [--quick]
 
-Every row is a periodic cell of two families of wires (`tests/helpers/crossing_cell.py`). `crossing_factor` is the
+Every row is a periodic cell of two families of wires (`tests/helpers/periodic_box.py`). `crossing_factor` is the
 viscous resistance to blood driven straight through, over the sum of two rows of such wires, each computed alike;
 `row_over_law` is such a row's over that of Tamada and Fujikawa (1957): what the grid gets wrong. The others are of
 blood that passes at an angle, some three times as fast along the wires as through them, at a wire Reynolds number of a
@@ -13,14 +13,16 @@ half, the mean of wires that lie one on the other and of wires in one plane, for
 
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from vstent.flow.drag import crossing_factor, drag_per_length, inertial_loss, tangential_share
+from vstent.geometry.surface import Surface
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
-from crossing_cell import VISCOSITY, Wires, crossing_wires, flow_through, row_of_wires, sheet_speed
+from periodic_box import VISCOSITY, crossing_wires, flow_through, row_of_wires, sheet_speed
 
 TABLE = Path(__file__).with_suffix(".json")
 CELLS = (
@@ -43,9 +45,10 @@ CREEPING = 1e-6
 """Body force of the creeping flow."""
 
 
-def viscous_resistance(wires: Wires) -> float:
+def viscous_resistance(box: tuple[int, int, int], wires: Sequence[Surface]) -> float:
     """Pressure drop over velocity, straight through (lattice units)."""
-    return CREEPING * wires.shape[2] / float(flow_through(wires, np.array([0, 0, CREEPING])).superficial_velocity[2])
+    force = np.array([0, 0, CREEPING])
+    return CREEPING * box[2] / float(flow_through(box, wires, force).superficial_velocity[2])
 
 
 def row_law(diameter: float, spacing: float) -> float:
@@ -53,13 +56,13 @@ def row_law(diameter: float, spacing: float) -> float:
     return VISCOSITY * float(drag_per_length(np.float64(diameter), np.float64(spacing))) / spacing
 
 
-def at_an_angle(wires: Wires, diameter: float) -> tuple[float, float, float]:
+def at_an_angle(box: tuple[int, int, int], wires: Sequence[Surface], diameter: float) -> tuple[float, float, float]:
     """Viscous resistance, it over the tangential one, and inertial loss, of blood that passes at an angle."""
-    height, viscous = wires.shape[2], viscous_resistance(wires)
+    height, viscous = box[2], viscous_resistance(box, wires)
     wanted = REYNOLDS * VISCOSITY / diameter
     along = SLANT * viscous / (1 + 0.5 * viscous / wanted)
     force = np.array([along, 0.0, viscous]) * wanted / height
-    flow = flow_through(wires, force)
+    flow = flow_through(box, wires, force)
     through, in_sheet = float(flow.superficial_velocity[2]), sheet_speed(flow, force)
     lost = force[2] * height - viscous * through
     return viscous, viscous * in_sheet / (force[0] * height), 2 * lost / (np.hypot(through, in_sheet) * through)
@@ -68,9 +71,11 @@ def at_an_angle(wires: Wires, diameter: float) -> tuple[float, float, float]:
 def row(across: int, along: int, diameter: float) -> dict[str, float]:
     spacing = along * across / float(np.hypot(along, across))
     height = 2 * round(min(1.5 * spacing, 60.0))
-    of_row = viscous_resistance(row_of_wires(round(spacing), height, diameter)) / row_law(diameter, round(spacing))
+    of_row = viscous_resistance((4, round(spacing), height), row_of_wires(round(spacing), height, diameter))
+    of_row /= row_law(diameter, round(spacing))
+    box = along, across, height
     one_on_the_other, in_one_plane = (
-        at_an_angle(crossing_wires(across, along, height, diameter, apart), diameter) for apart in (1.0, 0.0)
+        at_an_angle(box, crossing_wires(across, along, height, diameter, apart), diameter) for apart in (1.0, 0.0)
     )
     ratio, lengthwise = np.float64(diameter / spacing), np.float64(along**2 / (along**2 + across**2))
     return {

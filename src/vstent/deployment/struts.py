@@ -15,14 +15,14 @@ from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.units import MM_PER_UM
 
-SIDES: Final = 6
+SIDES: Final = 12
 """Number of sides of a round wire's section. A flat side faces the wall."""
 
 
 def struts(stent: Stent) -> Surface:
     """Build one closed solid per wire by sweeping the wire's section along its axis.
 
-    A round wire becomes a prism of six sides with the area of the circle. A laser-cut strut keeps its rectangular
+    A round wire becomes a prism of `SIDES` sides with the area of the circle. A laser-cut strut keeps its rectangular
     section, with its thickness perpendicular to the wall. Open wires end in flat caps, and rings are closed.
 
     Parameters
@@ -63,6 +63,11 @@ def struts(stent: Stent) -> Surface:
     is_used = np.zeros(len(points_mm) * sides, dtype=bool)  # no face uses the last points of rings
     is_used[faces] = True
     return Surface(vertices.reshape(-1, 3)[is_used], (np.cumsum(is_used) - 1).astype(np.int32)[faces])
+
+
+def thickness_mm(solids: Surface) -> float:
+    """Return the mean thickness 4 V / A of long solids: the diameter of round wires."""
+    return 4 * abs(solids.volume_mm3) / solids.area_mm2
 
 
 def over_restored(stent: Stent, anatomy: Anatomy) -> Stent:

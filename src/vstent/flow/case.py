@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+from vstent.deployment.struts import struts
 from vstent.devices.stent import Stent
 from vstent.flow.ends import End, FlowRate, Inflow
 from vstent.flow.settings import Blood, Numerics
@@ -88,6 +89,16 @@ class FlowCase:
     def ostium(self) -> Surface | None:
         """Surface through which blood enters the sac, or None (see `Target`)."""
         return None if self.target is None else self.target.ostium
+
+    @cached_property
+    def wires(self) -> Surface | None:
+        """Closed solids of the implants' wires over necks and ostia, which may overlap; None where there are none."""
+        solids = [struts(stent) for stent in self.solids if len(stent.wire_points_mm)]
+        if not solids:
+            return None
+        before = np.cumsum([0, *(len(solid.vertices_mm) for solid in solids)])
+        faces = [solid.faces + first for solid, first in zip(solids, before[:-1], strict=True)]
+        return Surface(np.concatenate([solid.vertices_mm for solid in solids]), np.concatenate(faces))
 
     @property
     def inlets_mL_s(self) -> Floats:
@@ -272,6 +283,8 @@ class FlowField:
     """Cell updates per second in the main loop on the finest grid."""
     phases: tuple[Phase, ...] = ()
     """The last cycle of a pulsatile flow at equally spaced times; empty for a steady flow."""
+    wire_force_N: Floats | None = None
+    """(3,) force of the blood on wires over necks and ostia at the end of the run; None where they are no walls."""
     mean_shear_Pa: Floats | None = None
     """(v,) time-averaged magnitude of the wall shear stress of an unsteady flow at constant inflow, which the mean
     vectors do not contain because oscillations cancel; None for any other flow."""
@@ -287,6 +300,7 @@ class FlowField:
         freeze(self, "inlets_mL_s inlet_pressure_Pa", np.float64, (len(self.inlets_mL_s),))
         freeze(self, "outlets_mL_s outlet_pressure_Pa", np.float64, (len(self.outlets_mL_s),))
         freeze(self, "residual", np.float64, (-1,))
+        freeze(self, "wire_force_N", np.float64, (3,))
 
     @property
     def inflow_mL_s(self) -> float:

@@ -7,10 +7,11 @@ from functools import cached_property
 import numpy as np
 from scipy import ndimage
 
+from vstent.deployment.struts import thickness_mm
 from vstent.errors import FlowError
 from vstent.flow import sampling
 from vstent.flow.case import Cells, FlowCase
-from vstent.flow.settings import Blood
+from vstent.flow.settings import LATTICE, Blood
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Opening, Vessel
 from vstent.kernels import triangles, voxels
@@ -28,6 +29,8 @@ MIN_CELLS = 2_000
 BRANCH_CELLS = 6.0
 """Number of cells across that a branch needs. Tubes at an angle to the grid have 2 to 70 % too much resistance with
 six cells across (Re 10 to 340), 10 to 310 % with four, and 1.4 to 15 times the right one with three."""
+LEAST_ACROSS, ACROSS = 2.0, 4.0
+"""Number of cells that a wire taken as a wall needs across, and that its drag needs for an error below 3 %."""
 WALL = 0
 """Patch number of the wall; opening k has patch number k + 1."""
 BEYOND = -1
@@ -36,6 +39,8 @@ BACK_TO_BACK = -0.5
 """Largest cosine between the normals of two walls that separate two blood cells. A corner that a link only clips
 does not separate them: bounce-back there would deflect a jet that leaves the edge (13 links, 3 % of the peak
 velocity in the FDA nozzle)."""
+CLIPPED = 0.15
+"""Least fraction of a link between two blood cells that lies in a wire which separates them."""
 
 
 class CoarseGridError(FlowError):
@@ -59,6 +64,10 @@ class Domain(Cells):
     """(s,) blood cell on one side of a wall thinner than a cell, with a blood cell on the other side."""
     septum_direction: Ints
     """(s,) index of the lattice velocity towards the other side; every pair is listed once."""
+    link_is_wire: Bools
+    """(l,) whether the link meets a wire, or a gap at one that is closed (see `between_wires`)."""
+    closed_gaps: int
+    """Number of cells in these gaps."""
     surface: Surface
     """Closed surface of the lumen with its extensions."""
     sections: tuple[Floats, ...]
@@ -68,6 +77,7 @@ class Domain(Cells):
         super().__post_init__()
         freeze(self, "link_cell link_direction link_patch", np.int32, (len(self.link_cell),))
         freeze(self, "link_fraction", np.float64, (len(self.link_cell),))
+        freeze(self, "link_is_wire", np.bool_, (len(self.link_cell),))
         freeze(self, "septum_cell septum_direction", np.int32, (len(self.septum_cell),))
 
     @cached_property
@@ -166,16 +176,28 @@ def default_cell_size_mm(case: FlowCase) -> float:
     """Return the grid spacing of a case: as set, else from `cells_per_diameter` and `cell_budget`.
 
     The cells are counted across the mean diameter 4 V / A of the vessel, or across its inlet where that is narrower,
-    because a large sac increases the mean.
+    because a large sac increases the mean. Wires to be resolved on a grid too coarse for them are refused.
     """
     numerics = case.numerics
-    if numerics.cell_size_mm is not None:
-        return numerics.cell_size_mm
     volume_mm3 = case.vessel.closed.volume_mm3
     across_mm = min(mean_diameter_mm(case.vessel), case.vessel.inlet.diameter_mm)
     by_diameter = across_mm / numerics.cells_per_diameter
     by_budget = (volume_mm3 / numerics.cell_budget) ** (1 / 3)
-    return max(by_diameter, by_budget)
+    size_mm = max(by_diameter, by_budget) if numerics.cell_size_mm is None else numerics.cell_size_mm
+    if numerics.engine == LATTICE and numerics.resolve_wires and case.wires and wires_of(case, size_mm) is None:
+        thick_mm = thickness_mm(case.wires)
+        raise CoarseGridError(
+            f"a grid spacing of {size_mm:.3g} mm does not resolve wires {thick_mm:.3g} mm thick: set "
+            f"{thick_mm / ACROSS:.2g} mm (--grid-spacing), or keep the screen model (without --resolve-wires)"
+        )
+    return size_mm
+
+
+def wires_of(case: FlowCase, cell_size_mm: float) -> Surface | None:
+    """Return the wires that are walls on a grid of this spacing; None where the media stand for them."""
+    if not case.numerics.resolve_wires or case.wires is None:
+        return None
+    return case.wires if thickness_mm(case.wires) > LEAST_ACROSS * cell_size_mm else None
 
 
 def mean_diameter_mm(vessel: Vessel) -> float:
@@ -183,21 +205,27 @@ def mean_diameter_mm(vessel: Vessel) -> float:
     return 4 * abs(vessel.closed.volume_mm3) / vessel.lumen.area_mm2
 
 
-def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None) -> Domain:
+def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None, wires: Surface | None = None) -> Domain:
     """Discretize the blood of a vessel on a regular grid: all that is connected to the inlet, or the most in a window.
 
-    A grid too coarse for that, or to reach another inlet, is refused.
+    `wires` are closed solids in it, which may overlap. A grid too coarse for the vessel, or to reach another inlet, is
+    refused.
     """
     surface, face_patch, sections = extend(vessel)
     if window is None:
         # An irregular offset avoids grid lines exactly through vertices and edges of analytic shapes.
         origin_mm = surface.vertices_mm.min(axis=0) - cell_size_mm * (2.0 + np.array([0.1327, 0.2171, 0.1733]))
         i, j, k = np.ceil((surface.vertices_mm.max(axis=0) - origin_mm) / cell_size_mm).astype(int) + 3
-        filled = voxels.fill((surface.corners_mm - origin_mm) / cell_size_mm, (int(i), int(j), int(k)))
+        shape = int(i), int(j), int(k)
+    else:
+        origin_mm, shape = window.origin_mm, window.mask.shape
+    lumen = voxels.fill((surface.corners_mm - origin_mm) / cell_size_mm, shape)
+    filled, closed_gaps = lumen, 0
+    if wires is not None:
+        filled, closed_gaps = between_wires(lumen, (wires.corners_mm - origin_mm) / cell_size_mm)
+    if window is None:
         inside = _connected(filled, vessel, sections[0], origin_mm, cell_size_mm)
     else:
-        origin_mm = window.origin_mm
-        filled = voxels.fill((surface.corners_mm - origin_mm) / cell_size_mm, window.mask.shape)
         label, _ = ndimage.label(filled & window.mask)
         inside = label == 1 + np.bincount(label.ravel())[1:].argmax()
     cells = np.argwhere(inside).astype(np.int32)
@@ -210,7 +238,9 @@ def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None) -> 
     grid = Cells(cells, origin_mm, cell_size_mm)
     neighbour = grid.neighbours()
     is_beyond = filled & ~inside & (window is not None)
-    links = _links(surface, face_patch, neighbour, grid, is_beyond)
+    if window is not None and wires is not None:
+        is_beyond &= ~window.mask  # blood enclosed by wires is no part of the vessel's continuation
+    links = _links(surface, face_patch, neighbour, grid, is_beyond, wires, lumen & ~filled)
     for patch, opening in enumerate(vessel.openings, start=1):
         # An outlet without cells only causes a warning (see `unreached`).
         if window is None and opening.is_inlet and patch not in links[3]:
@@ -219,7 +249,31 @@ def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None) -> 
                 f"({opening.diameter_mm:.2g} mm wide at {place(opening.center_mm)}), so no blood can enter there: use "
                 "a finer grid spacing"
             )
-    return Domain(cells, origin_mm, cell_size_mm, *links, *septa(surface, neighbour, grid), surface, sections)
+    parted = [np.stack(septa(surface, neighbour, grid))]
+    if wires is not None:
+        parted.append(np.stack(septa(wires, neighbour, grid, of_wires=True)))
+    both = np.unique(np.concatenate(parted, axis=1), axis=1)  # a link may cross a wire and the vessel's wall
+    return Domain(
+        cells, origin_mm, cell_size_mm, *links[:4], both[0], both[1], links[4], closed_gaps, surface, sections
+    )
+
+
+def between_wires(blood: Bools, corners: Floats) -> tuple[Bools, int]:
+    """Return a mask of blood without closed triangles (m, 3, 3), in grid units, and the number of cells in gaps closed.
+
+    A gap of a single cell between wires, or between a wire and the wall, is closed: its populations would bounce
+    between the walls. The mask may be periodic; else none of its border is blood.
+    """
+    taken = blood & voxels.fill(corners, blood.shape)
+    blood, closed = blood & ~taken, 0
+    while True:
+        gap = np.zeros_like(blood)
+        for axis in range(3):
+            beside = [(np.roll(blood, step, axis), np.roll(taken, step, axis)) for step in (1, -1)]
+            gap |= blood & ~beside[0][0] & ~beside[1][0] & (beside[0][1] | beside[1][1])
+        if not gap.any():
+            return blood, closed
+        blood, taken, closed = blood & ~gap, taken | gap, closed + int(gap.sum())
 
 
 def _connected(
@@ -311,25 +365,39 @@ def _strip(inner: Ints, outer: Ints) -> Ints:
 
 
 def _links(
-    surface: Surface, face_patch: Ints, neighbour: Ints, grid: Cells, is_beyond: Bools
-) -> tuple[Ints, Ints, Floats, Ints]:
-    """Return the links that leave the blood: their cell, direction, fraction to the surface and patch."""
+    surface: Surface,
+    face_patch: Ints,
+    neighbour: Ints,
+    grid: Cells,
+    is_beyond: Bools,
+    wires: Surface | None,
+    is_taken: Bools,
+) -> tuple[Ints, Ints, Floats, Ints, Bools]:
+    """Return the links that leave the blood: cell, direction, fraction to a wall, patch, and whether that is a wire.
+
+    The masks are the cells of blood beyond a window, and those in wires and the gaps closed at them.
+    """
     cell, direction = np.nonzero(neighbour < 0)
     starts, step_mm = grid.centers_mm[cell], VELOCITIES[direction] * grid.cell_size_mm
     length_mm = np.linalg.norm(step_mm, axis=1)
-    fraction = surface.first_hit(starts, step_mm / length_mm[:, None]) / length_mm
+    along, ahead = step_mm / length_mm[:, None], tuple((grid.cells[cell] + VELOCITIES[direction]).T)
+    to_lumen = surface.first_hit(starts, along) / length_mm
+    to_wire = np.full(len(cell), np.inf) if wires is None else wires.first_hit(starts, along) / length_mm
+    fraction = np.minimum(to_lumen, to_wire)
     is_missed = fraction > 1.0
+    is_wire = np.where(is_missed, is_taken[ahead], to_wire < to_lumen)
     fraction = np.clip(np.where(is_missed, 0.5, fraction), 1e-3, 1.0)
     _, _, face = surface.closest(starts + fraction[:, None] * step_mm)
-    goes_on = is_beyond[tuple((grid.cells[cell] + VELOCITIES[direction]).T)]
-    patch = np.where(is_missed, np.where(goes_on, BEYOND, WALL), face_patch[face])
-    return cell.astype(np.int32), direction.astype(np.int32), fraction, patch.astype(np.int32)
+    patch = np.where(is_missed, np.where(is_beyond[ahead], BEYOND, WALL), face_patch[face])
+    patch[is_wire] = WALL
+    return cell.astype(np.int32), direction.astype(np.int32), fraction, patch.astype(np.int32), is_wire
 
 
-def septa(surface: Surface, neighbour: Ints, grid: Cells) -> tuple[Ints, Ints]:
+def septa(surface: Surface, neighbour: Ints, grid: Cells, *, of_wires: bool = False) -> tuple[Ints, Ints]:
     """Return cell and lattice direction (s,) of the links between two blood cells that a wall separates, each once.
 
-    `neighbour` (n, 19) are the neighbours of the cells.
+    `neighbour` (n, 19) are the neighbours of the cells. A corner of the vessel that a link only clips does not separate
+    them, nor does a wire with less than `CLIPPED` of the link in it.
     """
     is_edge = np.asarray((neighbour < 0).any(axis=1))
     candidate = is_edge[:, None] & (neighbour >= 0) & is_edge[neighbour]
@@ -338,7 +406,14 @@ def septa(surface: Surface, neighbour: Ints, grid: Cells) -> tuple[Ints, Ints]:
     crosses = surface.crosses(grid.centers_mm[cell], grid.centers_mm[cell] + VELOCITIES[direction] * grid.cell_size_mm)
     cell, direction = cell[crosses], direction[crosses]
     starts, step_mm = grid.centers_mm[cell], VELOCITIES[direction] * grid.cell_size_mm
-    along = step_mm / np.linalg.norm(step_mm, axis=1)[:, None]
-    this_side, that_side = surface.first_hits(starts, along)[1], surface.first_hits(starts + step_mm, -along)[1]
-    parts = np.einsum("ij,ij->i", surface.normals[this_side], surface.normals[that_side]) < BACK_TO_BACK
+    length_mm = np.linalg.norm(step_mm, axis=1)
+    along = step_mm / length_mm[:, None]
+    (this_mm, this_side), (that_mm, that_side) = (
+        surface.first_hits(starts, along),
+        surface.first_hits(starts + step_mm, -along),
+    )
+    if of_wires:
+        parts = this_mm + that_mm < (1 - CLIPPED) * length_mm
+    else:
+        parts = np.einsum("ij,ij->i", surface.normals[this_side], surface.normals[that_side]) < BACK_TO_BACK
     return cell[parts].astype(np.int32), direction[parts].astype(np.int32)

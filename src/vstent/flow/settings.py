@@ -94,13 +94,18 @@ class Numerics:
     """How a flow is computed; its physics is in the other `FlowSettings`."""
 
     cell_size_mm: float | None = setting(
-        None, "grid-spacing", "spacing of the flow grid", limits=Limits("mm", 0.04, 1.0), usual="29 cells per diameter"
+        None, "grid-spacing", "spacing of the flow grid", limits=Limits("mm", 0.002, 1.0), usual="29 cells per diameter"
     )
     """Grid spacing; None: `cells_per_diameter` cells across the vessel, but at most `cell_budget` cells in all."""
     close_up: bool = setting(
         False, "refine-sac", "use the grid spacing only in and near the sac, and twice it elsewhere", flag
     )
     """Whether to use this grid spacing only in and near the sac, and twice it elsewhere (see `lattice.close_up`)."""
+    resolve_wires: bool = setting(
+        False, "resolve-wires", "take wires over necks and branches as walls of the flow grid, not as a screen", flag
+    )
+    """Whether the embedded engine takes the wires over necks and ostia as walls instead of as media. Coarser grids,
+    on which a flow only begins or which surround a refined region, have the media where wires are too thin for them."""
     cells_per_diameter: float = 29.0
     """Number of cells across the mean (hydraulic) diameter 4 V / A of the vessel, where no grid spacing is given."""
     cell_budget: float = 480_000.0

@@ -406,7 +406,7 @@ def test_a_parabola_that_is_zero_at_the_wall_is_reflected_as_itself(fraction):
     e = -slope * fraction - 0.5 * curvature * fraction**2
     arriving = 1 - e - (even + 0.5) * slope + (odd + 0.5) * h
     known = [leaving(0, 1), leaving(-1, 1), leaving(0, -1), leaving(-2, 1), leaving(-1, -1)]
-    weights, _ = parabolic_weights(np.array([fraction]), even + 0.5)
+    weights, _ = parabolic_weights(np.array([fraction]), even + 0.5, VESSEL_ODD_RATE)
     assert weights[0] @ known == pytest.approx(arriving, abs=1e-12)
 
 

@@ -163,8 +163,8 @@ def _parts(graph: csr_matrix, is_beyond: Bools, ends: Ints) -> Ints:
     return np.where(np.isin(part, through), np.searchsorted(through, part), -1).astype(np.int32)
 
 
-def build(case: FlowCase, cell_size_mm: float, chosen: CloseUp) -> Domain:
-    """Return the fine grid of a refined region.
+def build(case: FlowCase, cell_size_mm: float, chosen: CloseUp, wires: Surface | None = None) -> Domain:
+    """Return the fine grid of a refined region, with `wires` as walls in it (see `domain.build`).
 
     Links that leave the region through a cut have the patch number of their part: part p has the last opening's patch
     number plus p + 1.
@@ -180,7 +180,7 @@ def build(case: FlowCase, cell_size_mm: float, chosen: CloseUp) -> Domain:
     within |= ndimage.binary_dilation(within, np.ones((3, 3, 3), dtype=bool)) & ~outside
     fine = within.repeat(WIDTH, axis=0).repeat(WIDTH, axis=1).repeat(WIDTH, axis=2)
     corner_mm = outer.origin_mm + low * outer.cell_size_mm - 0.5 * (outer.cell_size_mm - cell_size_mm)
-    grid = domains.build(case.vessel, cell_size_mm, Window(corner_mm, fine))
+    grid = domains.build(case.vessel, cell_size_mm, Window(corner_mm, fine), wires)
     leads_beyond = grid.link_patch == BEYOND
     ahead_mm = cell_size_mm * VELOCITIES[grid.link_direction[leads_beyond]]
     beyond = np.flatnonzero(chosen.part >= 0)

@@ -15,7 +15,7 @@ from vstent.flow.domain import Domain
 from vstent.flow.ends import FlowRate, Inflow, Pressure
 from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.kernels import d3q19
-from vstent.flow.lattice.scales import ODD_RATE, Scales
+from vstent.flow.lattice.scales import Scales
 from vstent.flow.profile import developed_profile
 from vstent.kernels import directions
 from vstent.kernels.arrays import Floats, Ints
@@ -99,7 +99,7 @@ class Ends:
         normal = self.case.vessel.openings[k].normal
         places_mm = np.concatenate([self._along(links, part)[2] for part in (0.0, 0.5, 1.0)])
         speed = developed_profile(self.domain.sections[k], normal, places_mm)
-        return _sent(self.domain.link_direction[links], normal, area, *(-speed.reshape(3, -1, 1) * normal))
+        return self._sent(links, normal, area, *(-speed.reshape(3, -1, 1) * normal))
 
     def _entry(self, now: CloseUp, part: int, links: Ints) -> tuple[Floats, Floats]:
         """Return the row and profile coefficients of a cut with inflow.
@@ -112,7 +112,7 @@ class Ends:
         profile = (self._velocity(shown, links, way) / mean for way in (0.0, 0.5, 1.0))
         speed = now.inflow_mL_s[part] / self.scales.flow_mL_s / area
         row = self._row(d3q19.INFLOW, speed, normal, area)
-        return row, _sent(self.domain.link_direction[links], normal, area, *profile)
+        return row, self._sent(links, normal, area, *profile)
 
     def _exit(self, now: CloseUp, part: int, links: Ints) -> tuple[Floats, Floats]:
         """Return the row and profile coefficients of a cut with outflow.
@@ -158,24 +158,24 @@ class Ends:
         area = float(np.linalg.norm(faces))
         return faces / area, area
 
+    def _sent(self, links: Ints, normal: Floats, area: float, inner: Floats, at: Floats, outer: Floats) -> Floats:
+        """Return the source coefficients (l, 2) of an inflow: linear and quadratic in its mean speed.
 
-def _sent(direction: Ints, normal: Floats, area: float, inner: Floats, at: Floats, outer: Floats) -> Floats:
-    """Return the source coefficients (l, 2) of an inflow: linear and quadratic in its mean speed.
+        The velocities (l, 3) are those at the near end, the middle and the far end of every link.
 
-    The velocities (l, 3) are those at the near end, the middle and the far end of every link.
+        Links at the rim of the opening end at the wall instead of the opening, and their share of the flow would be
+        missing. It is added to the links near the rim. Scaling the whole profile instead would make the velocity on the
+        axis too high, and this error persists for tens of diameters downstream.
 
-    Links at the rim of the opening end at the wall instead of the opening, and their share of the flow would be
-    missing. It is added to the links near the rim. Scaling the whole profile instead would make the velocity on the
-    axis too high, and this error persists for tens of diameters downstream.
-
-    A velocity profile gains momentum from the relaxation rate of the odd populations, which would push blood towards
-    the axis: the inflow sends it back through the links with opposite sign.
-    """
-    c, weight = directions.VELOCITIES[direction], d3q19.WEIGHTS[direction]
-    sent = -6 * weight * (c * at).sum(axis=1)
-    of_inner, of_outer = (4.5 * (c * u).sum(axis=1) ** 2 - 1.5 * (u**2).sum(axis=1) for u in (inner, outer))
-    pushed = (2 / ODD_RATE - 1) * weight * (of_outer - of_inner)
-    speed = -(at @ normal)
-    rim = np.where(speed > 0, weight * np.maximum(c @ normal, 0.0) * (1 - speed / speed.max()), 0.0)
-    rim /= rim.sum()
-    return np.stack([sent + (area - sent.sum()) * rim, pushed - pushed.sum() * rim], axis=1)
+        A velocity profile gains momentum from the relaxation rate of the odd populations, which would push blood
+        towards the axis: the inflow sends it back through the links with opposite sign.
+        """
+        direction = self.domain.link_direction[links]
+        c, weight = directions.VELOCITIES[direction], d3q19.WEIGHTS[direction]
+        sent = -6 * weight * (c * at).sum(axis=1)
+        of_inner, of_outer = (4.5 * (c * u).sum(axis=1) ** 2 - 1.5 * (u**2).sum(axis=1) for u in (inner, outer))
+        pushed = (2 / self.scales.odd_rate - 1) * weight * (of_outer - of_inner)
+        speed = -(at @ normal)
+        rim = np.where(speed > 0, weight * np.maximum(c @ normal, 0.0) * (1 - speed / speed.max()), 0.0)
+        rim /= rim.sum()
+        return np.stack([sent + (area - sent.sum()) * rim, pushed - pushed.sum() * rim], axis=1)

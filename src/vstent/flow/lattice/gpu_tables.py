@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.kernels import gpu as kernels
-from vstent.flow.lattice.scales import ODD_RATE
 from vstent.flow.lattice.setup import Addressing, Links
 from vstent.flow.lattice.state import State
 from vstent.kernels.arrays import Floats, Ints
@@ -128,7 +127,7 @@ def correction_of(links: Links) -> NDArray[np.float32]:
 
 def rates_of(state: State) -> NDArray[np.float32]:
     """Return relaxation time at high shear rate, Carreau-Yasuda law (4) and relaxation rate of the odd part (6,)."""
-    return np.array([state.scales.relaxation_steps, *state.scales.thinning, ODD_RATE], np.float32)
+    return np.array([state.scales.relaxation_steps, *state.scales.thinning, state.scales.odd_rate], np.float32)
 
 
 def tables_of(state: State) -> Tables:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from vstent.deployment.struts import thickness_mm
 from vstent.flow import domain as domains
 from vstent.flow.case import FlowField, Level, Phase
 from vstent.flow.engines import Outcome
@@ -13,7 +14,8 @@ from vstent.flow.lattice import close_up as close_ups
 from vstent.flow.lattice.setup import CELL_REYNOLDS
 from vstent.flow.lattice.state import NECK_INFLOW, Snapshot, State
 from vstent.flow.wall_stress import mean_shear_Pa, wall_stress
-from vstent.kernels.arrays import Floats
+from vstent.kernels.arrays import Floats, Ints
+from vstent.kernels.directions import VELOCITIES
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +89,12 @@ def field_of(
     if state.close_up is None:
         too_coarse = domains.too_narrow(state.case, domain.cell_size_mm)
         too_coarse += domains.unreached(vessel, domain)
+    wires = domains.wires_of(state.case, domain.cell_size_mm)
+    if wires is not None:
+        advice += (
+            f" The wires are walls, {thickness_mm(wires) / domain.cell_size_mm:.2g} cells thick; {domain.closed_gaps} "
+            "cells in gaps narrower than a cell are closed."
+        )
     is_vessel = np.repeat(state.limit, state.addressing.length) == CELL_REYNOLDS
     moments_m_s = [phase.velocity_m_s[0] for phase in phases] or [flow.velocity_m_s]
     speed_m_s = np.max([np.linalg.norm(one, axis=1) for one in moments_m_s], axis=0)
@@ -110,7 +118,31 @@ def field_of(
         seconds=outcome.seconds,
         updates_per_s=len(domain.cells) * state.steps / state.loop_seconds,
         phases=phases,
+        wire_force_N=None if wires is None else force_N(state),
         mean_shear_Pa=flow.mean_shear_Pa,
         neck_inflow_mL_s=flow.neck_inflow_mL_s,
     )
     return field if state.close_up is None else close_ups.assembled(state.close_up, field)
+
+
+def force_N(state: State) -> Floats:
+    """Return the force (3,) of the blood on the wires that are walls: the momentum exchanged on their links.
+
+    References
+    ----------
+    Ladd 1994, J. Fluid Mech. 271, 285.
+    """
+    if state.device is not None:
+        state.device.fetch(state)
+    links, scales = state.links, state.scales
+    momentum = exchanged(state.populations, links.address[links.of_wires], links.wire_direction)
+    return momentum * scales.blood.density_kg_m3 * scales.cell_m**4 / scales.step_s**2
+
+
+def exchanged(populations: NDArray[np.float32], address: Ints, direction: Ints) -> Floats:
+    """Return the momentum (3,) that walls take up per step, in lattice units, from links with addresses (l, 6).
+
+    Populations must be at home.
+    """
+    sent, returned = (populations[address[:, k]].astype(np.float64) for k in (3, 0))
+    return np.asarray((sent + returned) @ VELOCITIES[direction])

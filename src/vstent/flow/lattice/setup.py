@@ -13,7 +13,7 @@ from vstent.flow.domain import Domain
 from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.ends import Ends
 from vstent.flow.lattice.kernels import d3q19, lanes
-from vstent.flow.lattice.scales import ODD_RATE, Scales
+from vstent.flow.lattice.scales import Scales
 from vstent.kernels import directions, voxels
 from vstent.kernels.arrays import Bools, Floats, Ints
 
@@ -155,6 +155,10 @@ class Links:
     """(m, k) speed or density to add to it, at m equally spaced times of a cycle."""
     shape: Floats
     """(m, o, 2) profile coefficients at the same times (see `d3q19.drive`)."""
+    of_wires: Ints
+    """(w,) links that meet wires."""
+    wire_direction: Ints
+    """(w,) lattice direction of each of them."""
 
     @property
     def is_inflow(self) -> Bools:
@@ -206,63 +210,63 @@ def thickest(case: FlowCase, domain: Domain) -> NDArray[np.float32]:
     return limit.astype(np.float32)
 
 
-def address(domain: Domain, limit: NDArray[np.float32]) -> Addressing:
-    """Return the memory layout of the populations of a domain; each segment has one `limit` (see `thickest`)."""
+def address(domain: Domain, limit: NDArray[np.float32], period: tuple[int, int, int] | None = None) -> Addressing:
+    """Return the memory layout of the populations of a domain; each segment has one `limit` (see `thickest`).
+
+    A domain with a `period` in cells repeats in all directions, and all its cells lie in one band.
+    """
     cells = domain.cells
-    inside = np.zeros(cells.max(axis=0) + 3, dtype=bool)
-    inside[tuple(cells.T)] = True
+    shape: Ints = cells.max(axis=0) + 3 if period is None else np.array(period)
+
+    def at(places: Ints) -> tuple[Ints, ...]:
+        return tuple((places % shape).T)
+
+    inside = np.zeros(shape, dtype=bool)
+    inside[at(cells)] = True
     stored = voxels.dilate(inside, directions.VELOCITIES[1:])
     number = np.full(inside.shape, -1, dtype=np.int32)
     # The padding between layers keeps two threads from writing to the same line of the cache.
     number[stored] = np.arange(stored.sum()) + lanes.COUNT * np.nonzero(stored)[0]
     count = int(number.max()) + lanes.COUNT
     stride = count + (OFF_PAGE - count) % PAGE
-    place = number[tuple(cells.T)]
+    place = number[at(cells)]
     is_new = (np.diff(cells, axis=0) != (0, 0, 1)).any(axis=1) | (np.diff(limit) != 0)
+    is_new |= (cells[1:, 2] == 1) | (cells[1:, 2] == shape[2] - 1)  # the neighbours of a period's end are apart
     first: Ints = np.flatnonzero(np.r_[True, is_new])
     length = np.diff(np.r_[first, len(cells)])
     pieces = -(-length // d3q19.SEGMENT)
     owner = np.repeat(np.arange(len(first)), pieces)
     offset = d3q19.SEGMENT * (np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces))
     first, length = first[owner] + offset, np.minimum(length[owner] - offset, d3q19.SEGMENT)
-    start = cells[first]
-    behind = [number[tuple((start - c).T)] for c in directions.VELOCITIES]
+    behind = [number[at(cells[first] - c)] for c in directions.VELOCITIES]
     q, cell = domain.septum_direction, cells[domain.septum_cell]
-    here, ahead = (number[tuple(x.T)] for x in (cell, cell + directions.VELOCITIES[q]))
+    here, ahead = number[at(cell)], number[at(cell + directions.VELOCITIES[q])]
     septa = np.stack([d3q19.OPPOSITE[q] * stride + here, q * stride + ahead]).astype(np.int32)
+    q, cell = domain.link_direction, cells[domain.link_cell]
+    p, c = d3q19.OPPOSITE[q], directions.VELOCITIES[q]
+    here, beyond, behind_one, behind_two = (number[at(cell + n * c)] for n in (0, 1, -1, -2))
+    has_one = inside[at(cell - c)] & ~np.isin(q * stride + here, septa)
+    has_two = has_one & inside[at(cell - 2 * c)] & ~np.isin(q * stride + behind_one, septa)
+    rows = [
+        p * stride + here,
+        p * stride + behind_one,
+        q * stride + here,
+        q * stride + beyond,
+        p * stride + np.where(has_two, behind_two, here),
+        q * stride + behind_one,
+    ]
     return Addressing(
         stride,
         place,
         length.astype(np.int32),
         first.astype(np.int32),
         d3q19.addresses(place[first], behind, stride),
-        *_link_addresses(domain, number, inside, stride, septa),
+        np.stack(rows, axis=1).astype(np.int32),
+        has_one,
+        has_two,
         septa,
         domain.septum_cell,
     )
-
-
-def _link_addresses(
-    domain: Domain, number: Ints, inside: NDArray[np.bool_], stride: int, septa: Ints
-) -> tuple[Ints, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return addresses (l, 6) for `d3q19.paths`, and whether at least one and two blood cells lie behind each link."""
-    q = domain.link_direction
-    p = d3q19.OPPOSITE[q]
-    cell, c = domain.cells[domain.link_cell], directions.VELOCITIES[q]
-    second = np.maximum(cell - 2 * c, 0)
-    here, ahead, behind = (number[tuple(x.T)] for x in (cell, cell + c, cell - c))
-    has_one = inside[tuple((cell - c).T)] & ~np.isin(q * stride + here, septa)
-    has_two = has_one & inside[tuple(second.T)] & ~np.isin(q * stride + behind, septa)
-    further = np.where(has_two, number[tuple(second.T)], here)
-    rows = [
-        p * stride + here,
-        p * stride + behind,
-        q * stride + here,
-        q * stride + ahead,
-        p * stride + further,
-        q * stride + behind,
-    ]
-    return np.stack(rows, axis=1).astype(np.int32), has_one, has_two
 
 
 def build_links(case: FlowCase, grid: Grid, scales: Scales, close_up: CloseUp | None) -> Links:
@@ -272,13 +276,8 @@ def build_links(case: FlowCase, grid: Grid, scales: Scales, close_up: CloseUp | 
     patches = np.unique(patch[patch > 0])
     of_ends = patch[: grid.of_ends]
     start: Ints = np.asarray(np.searchsorted(of_ends, np.r_[patches, patches[-1] + 1]), dtype=np.int32)
-    fraction = domain.link_fraction[order]
-    weight = linear_weights(fraction, addressing.link_has_one[order])
-    correction, viscous = parabolic_weights(fraction, scales.relaxation_steps)
-    correction[:, :3] -= weight
-    is_plain = ~addressing.link_has_two[order]
-    is_plain[: start[-1]] = True
-    correction[is_plain], viscous[is_plain], weight[: start[-1]] = 0.0, 0.0, (-1.0, 0.0, 0.0)
+    weight, correction, viscous = wall_weights(domain, addressing, order, scales.relaxation_steps, scales.odd_rate)
+    correction[: start[-1]], viscous[: start[-1]], weight[: start[-1]] = 0.0, 0.0, (-1.0, 0.0, 0.0)
     opening_links = order[: start[-1]]
     ends = Ends(case, domain, scales, close_up)
     openings, wanted, course, shape = ends.imposed(patches, np.split(opening_links, start[1:-1]))
@@ -298,7 +297,25 @@ def build_links(case: FlowCase, grid: Grid, scales: Scales, close_up: CloseUp | 
         wanted,
         course,
         shape,
+        of_wires := np.flatnonzero(domain.link_is_wire[order]).astype(np.int32),
+        domain.link_direction[order[of_wires]],
     )
+
+
+def wall_weights(
+    domain: Domain, addressing: Addressing, order: Ints, relaxation_steps: float, odd_rate: float
+) -> tuple[Floats, Floats, Floats]:
+    """Return the linear weights (l, 3) of walls, their correction (l, 5) and its viscous part (l,), for ordered links.
+
+    Where fewer than two cells of blood lie behind a link there is no correction.
+    """
+    fraction = domain.link_fraction[order]
+    weight = linear_weights(fraction, addressing.link_has_one[order])
+    correction, viscous = parabolic_weights(fraction, relaxation_steps, odd_rate)
+    correction[:, :3] -= weight
+    is_plain = ~addressing.link_has_two[order]
+    correction[is_plain], viscous[is_plain] = 0.0, 0.0
+    return weight, correction, viscous
 
 
 def linear_weights(fraction: Floats, has_one: NDArray[np.bool_]) -> Floats:
@@ -332,7 +349,7 @@ def quadratic_weights(fraction: Floats) -> Floats:
     return np.where(x[:, None] < 0.5, near, far)
 
 
-def parabolic_weights(fraction: Floats, relaxation_steps: float) -> tuple[Floats, Floats]:
+def parabolic_weights(fraction: Floats, relaxation_steps: float, odd_rate: float) -> tuple[Floats, Floats]:
     """Return the weights of bounce-back that is exact for a parabolic velocity along the link.
 
     Quadratic interpolation alone leaves a slip velocity of up to an eighth of the squared grid spacing times the flow's
@@ -345,7 +362,7 @@ def parabolic_weights(fraction: Floats, relaxation_steps: float) -> tuple[Floats
     ----------
     Ginzburg and d'Humieres 2003, Phys. Rev. E 68, 066614, sec. III.
     """
-    x, even, odd = fraction, relaxation_steps - 0.5, 1 / ODD_RATE - 0.5
+    x, even, odd = fraction, relaxation_steps - 0.5, 1 / odd_rate - 0.5
     per = 1 / np.maximum(1, x * (2 * x + 1))
     viscous = even * (odd + np.abs(x - 0.5)) * per
     return quadratic_weights(fraction) + np.outer(x * (1 - x) * per - viscous, CURVE), viscous

@@ -10,6 +10,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from vstent.devices.stent import Stent
 from vstent.flow import domain as domains
 from vstent.flow import sampling
 from vstent.flow.case import FlowCase, FlowField
@@ -18,7 +19,7 @@ from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.gpu import require_gpu, told
 from vstent.flow.lattice.kernels import d3q19, lanes
 from vstent.flow.lattice.kernels.warm import keep_flow
-from vstent.flow.lattice.scales import ODD_RATE, Scales
+from vstent.flow.lattice.scales import Scales, odd_rate
 from vstent.flow.lattice.screen import build_screen
 from vstent.flow.lattice.setup import Grid, Refill, address, build_links, thickest
 from vstent.flow.lattice.state import DEFER_PAIRS, DEFER_PART, Probe, Snapshot, State, speeds
@@ -31,8 +32,8 @@ SLICE_UPDATES: Final = 2e8
 GPU_SLICE_UPDATES: Final = 2e9
 """The same on a GPU: some tenths of a second."""
 
-_GRIDS: WeakKeyDictionary[Vessel, dict[float, Grid]] = WeakKeyDictionary()
-"""Grids of whole vessels by grid spacing, as long as the vessel exists."""
+_GRIDS: WeakKeyDictionary[Vessel, dict[tuple[float, tuple[Stent, ...]], Grid]] = WeakKeyDictionary()
+"""Grids of whole vessels by grid spacing and resolved wires, as long as the vessel exists."""
 
 
 def build(
@@ -55,9 +56,11 @@ def build(
         require_gpu()
     keep_flow()
     scales = Scales(cell_size_mm * M_PER_MM, check_s / int(pace[0]), case.blood)
+    scales = replace(scales, odd_rate=odd_rate(scales.relaxation_steps))
     grid = _grid(case, cell_size_mm, close_up)
     domain, addressing = grid.domain, grid.addressing
     links = build_links(case, grid, scales, close_up)
+    case = replace(case, media=()) if domains.wires_of(case, cell_size_mm) else case
     screen = build_screen(case, domain, addressing, scales)
     points_mm, area_mm2 = np.zeros((0, 3)), np.zeros((0, 3))
     if case.ostium is not None:
@@ -103,16 +106,18 @@ def prepare(case: FlowCase, cell_size_mm: float) -> None:
 
 
 def _grid(case: FlowCase, cell_size_mm: float, close_up: CloseUp | None) -> Grid:
-    """Return the grid of a case; that of a whole vessel is the same for all its flows and is built once."""
+    """Return the grid of a case; that of a whole vessel is the same for all its flows with the same walls."""
     built = _GRIDS.setdefault(case.vessel, {}) if close_up is None else {}
-    if cell_size_mm not in built:
+    wires = domains.wires_of(case, cell_size_mm)
+    key = cell_size_mm, () if wires is None else case.solids
+    if key not in built:
         if close_up is None:
-            domain = domains.build(case.vessel, cell_size_mm)
+            domain = domains.build(case.vessel, cell_size_mm, wires=wires)
         else:
-            domain = close_ups.build(case, cell_size_mm, close_up)
+            domain = close_ups.build(case, cell_size_mm, close_up, wires)
         limit = thickest(case, domain)
-        built[cell_size_mm] = Grid(domain, limit, address(domain, limit))
-    return built[cell_size_mm]
+        built[key] = Grid(domain, limit, address(domain, limit))
+    return built[key]
 
 
 def exchange(state: State, case: FlowCase) -> None:
@@ -233,7 +238,7 @@ def _advance_here(state: State, wanted: Floats, moments: Floats, first_pair: int
     f, links, refill, scales = state.populations, state.links, state.refill, state.scales
     a, screen = state.addressing, state.screen
     shares = d3q19.share(a.length, screen.start, state.bands, numba.get_num_threads())
-    relaxation = np.float32(scales.relaxation_steps), scales.thinning, state.limit, np.float32(ODD_RATE)
+    relaxation = np.float32(scales.relaxation_steps), scales.thinning, state.limit, np.float32(scales.odd_rate)
     cells = a.address, a.length, relaxation, (screen.start, screen.place, screen.entry)
     back = links.path, links.weight, links.source, links.by_layer, refill.place, refill.refill, a.septa
     of_openings = links.start, links.address, links.place, links.direction, links.shape
@@ -267,7 +272,7 @@ def snapshot(state: State) -> Snapshot:
             times = d3q19.relaxation_times(state.populations, a.stride, a.place[cells], time, law)
         else:
             times = state.device.read_times()
-        velocity[cells] = d3q19.resisted(velocity[cells], state.screen.entry, times, np.float32(ODD_RATE))
+        velocity[cells] = d3q19.resisted(velocity[cells], state.screen.entry, times, np.float32(state.scales.odd_rate))
     return Snapshot(state.scales, velocity, density, outflow)
 
 

@@ -7,7 +7,6 @@ from typing import Final
 
 import numpy as np
 
-from vstent.deployment.struts import struts
 from vstent.errors import FlowError, LandingError
 from vstent.flow.case import FlowCase
 from vstent.flow.openfoam import control, mesh
@@ -40,15 +39,12 @@ def strut_solids(case: FlowCase) -> Surface | None:
             "the engine openfoam does not support the screen model of a stent: give the stent itself, whose struts are "
             "meshed, or choose the embedded engine"
         )
-    solids = [struts(one) for one in case.solids if len(one.wire_points_mm)]
-    if not solids:
+    if case.wires is None:
         raise LandingError(
             "no wire of the device is over a neck or a branch's ostium, the only places where OpenFOAM meshes struts: "
             "move the landing zone across one, or compute without the device"
         )
-    before = np.cumsum([0, *(len(one.vertices_mm) for one in solids)])
-    faces = [one.faces + first for one, first in zip(solids, before[:-1], strict=True)]
-    return Surface(np.concatenate([one.vertices_mm for one in solids]), np.concatenate(faces))
+    return case.wires
 
 
 def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:

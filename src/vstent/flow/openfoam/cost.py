@@ -4,6 +4,7 @@ from typing import Final
 
 import numpy as np
 
+from vstent.deployment.struts import thickness_mm
 from vstent.errors import FlowError
 from vstent.flow.case import FlowCase
 from vstent.flow.domain import extended_volume_mm3
@@ -42,9 +43,9 @@ def tell_cost(case: FlowCase, cell_size_mm: float) -> str:
     needed = BYTES_AT_LEAST + BYTES_PER_CELL * (bare + at_struts)
     if needed > free:
         advice = f"choose the engine {LATTICE}, which does not have to resolve the device's wires"
-        for size_mm in cell_size_mm * WIDER ** np.arange(1, TRIED):
+        for size_mm in (float(f"{wider:.2g}") for wider in cell_size_mm * WIDER ** np.arange(1, TRIED)):
             if memory_bytes(case, size_mm) < free:
-                advice = f"set a grid spacing of {size_mm:.2g} mm"
+                advice = f"set a grid spacing of {size_mm:g} mm"
                 break
         raise FlowError(
             f"OpenFOAM's mesh of {(bare + at_struts) / 1e6:.3g} million cells at a grid spacing of {cell_size_mm:.3g} "
@@ -66,10 +67,11 @@ def memory_bytes(case: FlowCase, cell_size_mm: float) -> float:
 def _cells(case: FlowCase, cell_size_mm: float) -> tuple[float, float]:
     """Return the number of cells of the bare vessel, and of the refined ones at the struts."""
     bare = CELLS_PER_CUBE * extended_volume_mm3(case.vessel) / cell_size_mm**3
-    if not case.solids:
+    struts = strut_solids(case) if case.solids else None
+    if struts is None:
         return bare, 0.0
-    setup = FoamSetup(cell_size_mm, struts=strut_solids(case))
+    setup = FoamSetup(cell_size_mm, struts=struts)
     small_mm = cell_size_mm / 2**setup.levels_at_struts
     base, more = CELLS_ALONG_WIRE
     length_mm = sum(one.wire_length_mm for one in case.solids)
-    return bare, length_mm / small_mm * (base + more * setup.strut_thickness_mm / small_mm)
+    return bare, length_mm / small_mm * (base + more * thickness_mm(struts) / small_mm)

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 
+from vstent.deployment.struts import thickness_mm
 from vstent.flow.openfoam.dialects import DIALECTS, Dialect, Flavour
 from vstent.geometry.surface import Surface
 
@@ -42,9 +43,4 @@ class FoamSetup:
         """Number of times that cells at the struts are halved, until at least `ACROSS` are across a strut."""
         if self.struts is None:
             return 0
-        return max(0, math.ceil(math.log2(ACROSS * self.cell_size_mm / self.strut_thickness_mm)))
-
-    @property
-    def strut_thickness_mm(self) -> float:
-        """Mean thickness of the struts, 4 V / A as for a long solid; 0 without struts."""
-        return 0.0 if self.struts is None else 4 * abs(self.struts.volume_mm3) / self.struts.area_mm2
+        return max(0, math.ceil(math.log2(ACROSS * self.cell_size_mm / thickness_mm(self.struts))))

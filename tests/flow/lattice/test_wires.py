@@ -1,0 +1,100 @@
+"""Wires of a device as walls of the flow grid in a vessel, on one grid and in a refined region."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import vstent
+from vstent import phantoms
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.trace import trace
+from vstent.anatomy.trim import trim
+from vstent.deployment.struts import united
+from vstent.flow import domain
+from vstent.flow.case import FlowCase
+from vstent.flow.domain import CoarseGridError
+from vstent.flow.lattice import stepping
+from vstent.flow.lattice.engine import LatticeBoltzmann
+from vstent.flow.lattice.reading import exchanged, force_N
+from vstent.flow.lattice.state import State
+from vstent.flow.problem import flow_case
+from vstent.flow.settings import FlowSettings, Numerics
+from vstent.flow.simulation import simulate_case
+from vstent.geometry.vessel import Vessel
+
+CELL_MM = 0.075
+
+
+@pytest.fixture(scope="module")
+def resolved() -> FlowCase:
+    """A short tube with a sac, and a device with wide struts over its neck."""
+    tube = phantoms.with_sac(
+        phantoms.tube(length_mm=24.0, radius_mm=1.4),
+        abscissa_mm=12.0,
+        width_mm=3.0,
+        neck_mm=2.2,
+        direction=np.array([1.0, 0.0, 0.0]),
+    )
+    whole = trace(Vessel(phantoms.phantom_surface(tube, edge_mm=0.2)))
+    anatomy = restore(whole)
+    design = replace(vstent.find_design("enterprise"), strut_width_um=220.0, strut_thickness_um=220.0)
+    stent = vstent.deploy(design, anatomy).stent
+    numerics = Numerics(cell_size_mm=CELL_MM, resolve_wires=True)
+    case = flow_case(anatomy, (stent,), FlowSettings(inflow_mL_s=1.0, numerics=numerics))
+    return replace(case, vessel=trim(whole, upstream_mm=3.0, downstream_mm=3.0))
+
+
+def test_the_blood_is_the_lumen_without_the_wires(resolved: FlowCase) -> None:
+    assert resolved.wires is not None
+    bare = domain.build(resolved.vessel, CELL_MM)
+    grid = domain.build(resolved.vessel, CELL_MM, wires=resolved.wires)
+    left = bare.index[tuple(grid.cells.T)]
+    assert (left >= 0).all()
+    gone = np.setdiff1d(np.arange(len(bare.cells)), left)
+    inside = united(resolved.wires).signed_distance(bare.centers_mm) < 0  # an exact union of the solids
+    assert inside[gone].sum() == inside.sum()
+    closed = ~inside[gone]
+    assert grid.closed_gaps <= closed.sum() < grid.closed_gaps + 0.05 * inside.sum()  # the rest is enclosed
+
+
+@pytest.fixture(scope="module")
+def flow(resolved: FlowCase) -> State:
+    """The steady flow through it."""
+    engine = LatticeBoltzmann(CELL_MM)
+    state = engine.init(resolved, None)
+    while len(state.history) < 16:
+        stepping.step(state)
+    return state
+
+
+def test_walls_wires_and_ends_together_take_up_no_momentum_in_steady_flow(flow: State) -> None:
+    address, stride = flow.links.address, flow.addressing.stride
+    of_walls = slice(flow.links.start[-1], None)
+    direction = address[:, 2] // stride
+    on_walls = exchanged(flow.populations, address[of_walls], direction[of_walls])
+    whole = exchanged(flow.populations, address, direction)
+    np.testing.assert_allclose(whole, 0.0, atol=0.015 * np.linalg.norm(on_walls))
+
+
+def test_blood_drags_wires_along(resolved: FlowCase, flow: State) -> None:
+    assert resolved.wires is not None
+    force, direction = force_N(flow), flow.links.wire_direction
+    momentum = exchanged(flow.populations, flow.links.address[flow.links.of_wires], direction)
+    scales = flow.scales
+    speed = scales.cell_m / scales.step_s
+    np.testing.assert_allclose(force, momentum * 1060.0 * scales.cell_m**2 * speed**2)
+    along = np.gradient(resolved.vessel.centerlines[0].points_mm, axis=0).mean(axis=0)
+    assert force @ along > 0
+
+
+def test_a_grid_too_coarse_for_the_wires_is_refused_and_a_first_guess_has_the_screen(resolved: FlowCase) -> None:
+    coarse = replace(resolved, numerics=replace(resolved.numerics, cell_size_mm=0.15))
+    with pytest.raises(
+        CoarseGridError, match=r"does not resolve wires 0\.206 mm thick: set 0\.051 mm \(--grid-spacing\)"
+    ):
+        simulate_case(coarse)
+    assert domain.wires_of(resolved, 2 * CELL_MM) is None
+    guess = LatticeBoltzmann(2 * CELL_MM).init(resolved, None)
+    assert len(guess.screen.cell) > 0
+    assert not len(guess.links.of_wires)
