@@ -116,9 +116,7 @@ COMMANDS = {
 
 
 @pytest.fixture(scope="module")
-def existing(
-    arteries: tuple[Path, Path], restored: Path, tmp_path_factory: pytest.TempPathFactory
-) -> dict[str, Path]:
+def existing(arteries: tuple[Path, Path], restored: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Case folders by what they hold."""
     folders = {name: shutil.copytree(restored, tmp_path_factory.mktemp("existing") / "out") for name in EXISTING}
     with pytest.MonkeyPatch.context() as patch:

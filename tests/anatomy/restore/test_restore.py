@@ -373,7 +373,7 @@ def test_the_real_sac_is_that_of_aneurisk_web(shared_data) -> None:
     assert found["neck_plane_area_low_mm2"] < 38.5 < found["neck_plane_area_high_mm2"]
 
 
-@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize("side", [pytest.param(-1.0, marks=pytest.mark.validation), 1.0])
 def test_the_idealised_bifurcation_is_restored_to_the_one_without_its_sac(shared_data, side: float) -> None:
     sick, healthy, radius, distance_mm = beside_the_fork_without_sac(shared_data, side)
     assert len(sick.aneurysms) == 1

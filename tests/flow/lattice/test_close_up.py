@@ -137,7 +137,7 @@ def test_a_close_up_of_womersleys_flow_is_womersleys_flow() -> None:
     vessel = tube(line(40.0), RADIUS_MM).vessel
     inflow_mL_s = MEAN_MEAN_M_S * np.pi * RADIUS_M**2 * 1e6
     settings = FlowSettings(
-        inflow_mL_s=inflow_mL_s, waveform=PULSE, numerics=Numerics(cell_size_mm=0.25, close_up=True, lattice_speed=0.05)
+        inflow_mL_s=inflow_mL_s, waveform=PULSE, numerics=Numerics(cell_size_mm=0.3, close_up=True, lattice_speed=0.05)
     )
     field = simulate_case(vessel_case(vessel, settings, target=Target(ball((0.0, 0.0, 24.0)), None)))
     assert field.is_converged
