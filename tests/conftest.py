@@ -7,8 +7,8 @@ import pytest
 
 # As the command line has it, and before any test imports numpy: threads of the linear algebra only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# Threads of the compiled kernels sleep while they wait: on small grids, and beside other test processes, they would spin
-# for half of the time that a flow takes.
+# Threads of the compiled kernels sleep while they wait: beside other test processes, and on small grids, they would spin
+# for half of the time.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 

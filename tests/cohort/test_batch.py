@@ -46,7 +46,8 @@ from vstent.study.store import Key, Store
 from vstent.study.workers import DaskCluster, Processes, Slurm
 
 TREATMENTS = (with_device("leo"), with_device("enterprise", center_mm=27.0))
-"""Devices with few wires. The Enterprise within an artery of 44 mm, beyond the end of one of 11 mm that is continued to 31.5 mm."""
+"""Devices with few wires: the Enterprise lies within an artery of 44 mm, and beyond the end of one of 11 mm that is
+continued to 31.5 mm."""
 GIVEN = {"treatment": TREATMENTS, "no-flow": True, "units": "mm"}
 SETTINGS = settings_of(GIVEN)
 
