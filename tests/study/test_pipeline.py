@@ -335,11 +335,14 @@ def test_of_two_vessels_in_one_surface_the_one_at_the_point_given_is_taken(tmp_p
 
 
 def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    arteries: tuple[Path, Path],
+    stored: tuple[Path, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    artery, out = tmp_path / "artery.stl", tmp_path / "out"
-    write_stl(artery, phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.5))
-    command = ["run", str(artery), "--out", str(out), "--device", "leo", "--grid-spacing", "0.35"]
+    out = shutil.copytree(stored[0], tmp_path / "out")
+    command = ["run", str(arteries[0]), "--out", str(out), "--units", "mm", "--device", "leo", "--grid-spacing", "0.35"]
     real, computed = stages.simulate_case, []
 
     def stopped_with_a_stent(case: FlowCase, *, start: FlowField | None, **given: object) -> FlowField:

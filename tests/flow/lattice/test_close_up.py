@@ -77,13 +77,13 @@ def outer_of_demo() -> tuple[FlowCase, FlowField]:
 
 @cache
 def pulse_of_demo() -> tuple[FlowCase, FlowField]:
-    """A pulse around it, with a screen across the neck and outlets that share the flow."""
+    """A pulse around it, with a screen across the neck."""
     case, _ = outer_of_demo()
     points_mm = demo().aneurysms[0].neck.vertices_mm
     ones = np.ones(len(points_mm))
     resistances = 300 * ones, 150 * ones, 0.5 * ones
     screen = Sheet(points_mm, ones[:, None] * [0.0, 0.6, 0.8], 0.1 * ones, *resistances, ones, ones)
-    settings = FlowSettings(waveform=OLDER_ADULT_ICA, outlets="murray", numerics=replace(case.numerics, max_cycles=1))
+    settings = FlowSettings(waveform=OLDER_ADULT_ICA, numerics=replace(case.numerics, max_cycles=1))
     pulse = vessel_case(case.vessel, settings, target=case.target, media=(screen,))
     return pulse, simulate_case(pulse)
 
