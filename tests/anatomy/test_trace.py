@@ -246,29 +246,6 @@ def test_a_guess_of_the_inlet_is_not_made_anew_by_trimming() -> None:
     assert [note for note in trimmed.notes if "because it is the widest opening" in note] == [whole.notes[-1]]
 
 
-def test_real_centerlines_agree_with_vmtk(shared_data) -> None:
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
-
-    from vstent.io.surfaces import read_surface
-
-    vessel = trace(Vessel(read_surface(shared_data / "aneurisk_C0038.vtp")[0]))
-    reader = vtkXMLPolyDataReader()
-    reader.SetFileName(str(shared_data / "aneurisk_C0038_centerlines.vtp"))
-    reader.Update()
-    data = reader.GetOutput()
-    reference = vtk_to_numpy(data.GetPoints().GetData()).astype(float)
-    radius = vtk_to_numpy(data.GetPointData().GetArray("MaximumInscribedSphereRadius"))
-    assert len(vessel.centerlines) == 8
-    line = vessel.centerlines[1]
-    healthy = (line.abscissa_mm > 5) & (line.abscissa_mm < 60)  # before the sac; VMTK stops short of the ends
-    from scipy.spatial import cKDTree
-
-    distance, nearest = cKDTree(reference).query(line.points_mm[healthy])
-    assert distance.mean() < 0.1
-    assert np.abs(line.inscribed_radius_mm[healthy] - radius[nearest]).mean() < 0.05
-
-
 def test_the_band_of_the_threshold_is_carried_to_the_measures() -> None:
     image = phantoms.scan(phantoms.siphon(), np.random.default_rng(0), scanner=phantoms.Scanner(0.4, 0.3))
     scanned = segment(image)

@@ -45,8 +45,9 @@ from vstent.study.settings import AnatomySettings, InputSettings, settings_of
 from vstent.study.store import Key, Store
 from vstent.study.workers import DaskCluster, Processes, Slurm
 
-TREATMENTS = (with_device("silk"), with_device("enterprise", center_mm=27.0))
-"""The Enterprise within an artery of 44 mm, beyond the end of one of 11 mm that is continued to 31.5 mm."""
+TREATMENTS = (with_device("leo"), with_device("enterprise", center_mm=27.0))
+"""Devices with few wires: the Enterprise lies within an artery of 44 mm, and beyond the end of one of 11 mm that is
+continued to 31.5 mm."""
 GIVEN = {"treatment": TREATMENTS, "no-flow": True, "units": "mm"}
 SETTINGS = settings_of(GIVEN)
 
@@ -61,7 +62,7 @@ def scans(tmp_path_factory):
         artery = phantoms.with_sac(
             phantoms.tube(length_mm=length_mm), abscissa_mm=0.5 * length_mm, width_mm=5.0, neck_mm=3.5
         )
-        write_stl(folder / f"{name}.stl", phantoms.phantom_surface(artery, edge_mm=0.45))
+        write_stl(folder / f"{name}.stl", phantoms.phantom_surface(artery, edge_mm=0.7))
     (folder / "c.stl").write_text("no surface")
     (folder / "notes.txt").write_text("no case")
     return folder
@@ -115,7 +116,7 @@ def test_the_table_has_a_row_a_case_and_device_with_every_metric_or_the_failure(
         assert {key: row[key] for key in wanted} == wanted
         assert row["outcome"] == "done"
         assert row["sentence"] == study.implants[device][device].advice
-    assert by_name["b", "silk"]["outcome"] == "done"
+    assert by_name["b", "leo"]["outcome"] == "done"
     assert by_name["b", "enterprise"]["outcome"] == "failed"
     assert by_name["b", "enterprise"]["stage"] == "deploy enterprise"
     assert "beyond the distal end" in by_name["b", "enterprise"]["sentence"]
@@ -136,8 +137,8 @@ def test_a_device_whose_flow_fails_leaves_the_files_of_the_others(scans, tmp_pat
     (task,) = left_to_do([case], tmp_path, keeps_files=True)
     work(task)
     kept = json.loads((task.folder / "study" / "metrics.json").read_text())
-    assert list(kept["treatments"]) == ["silk"]
-    assert [path.name for path in (task.folder / "study" / "treatments").iterdir()] == ["silk"]
+    assert list(kept["treatments"]) == ["leo"]
+    assert [path.name for path in (task.folder / "study" / "treatments").iterdir()] == ["leo"]
 
 
 @pytest.mark.system
@@ -187,14 +188,14 @@ def test_a_second_run_does_only_what_is_missing(scans, table, tmp_path):
             Store(tmp_path / "cases" / case.name / CACHE).write(device, key, {}, values=row)
     assert left_to_do(cases, tmp_path) == []
     # one row damaged, one input changed, one more device: just these are missing
-    stored_row(tmp_path / "cases" / "a", "silk").write_text('{"values": ')
+    stored_row(tmp_path / "cases" / "a", "leo").write_text('{"values": ')
     changed = [replace(case, path=scans / "a.stl") if case.name == "b" else case for case in cases]
     treatments = (*TREATMENTS, with_device("pipeline"))
     more = [replace(c, settings=replace(c.settings, treatments=treatments)) for c in changed]
     missing = {task.case.name: task.case.settings.devices for task in left_to_do(more, tmp_path)}
     assert missing == {
-        "a": ("silk", "pipeline"),
-        "b": ("silk", "enterprise", "pipeline"),
+        "a": ("leo", "pipeline"),
+        "b": ("leo", "enterprise", "pipeline"),
         "c": ("pipeline",),
     }
     # another threshold is another study
@@ -205,24 +206,24 @@ def test_a_second_run_does_only_what_is_missing(scans, table, tmp_path):
 def test_the_command_writes_the_table_twice_and_a_report(scans, table, tmp_path, capsys):
     out = tmp_path / "out"
     listed = tmp_path / "cohort.csv"
-    listed.write_text(f"case,input,device,at\nfirst,{scans / 'a.stl'},silk,\nlast,{scans / 'c.stl'},,\n")
+    listed.write_text(f"case,input,device,at\nfirst,{scans / 'a.stl'},leo,\nlast,{scans / 'c.stl'},,\n")
     command = ["batch", str(listed), "--out", str(out), "--no-flow", "--units", "mm", "--device", "enterprise"]
     assert main([*command, "--jobs", "2", "--keep-files"]) == 0
     said = capsys.readouterr()
     assert "2 cases, 2 rows; 2 cases to do: about 1 min" in said.out
     with (out / "cohort.csv").open(newline="") as file:
         first, last = csv.DictReader(file)
-    assert (first["case"], first["treatment"], first["outcome"]) == ("first", "silk", "done")
+    assert (first["case"], first["treatment"], first["outcome"]) == ("first", "leo", "done")
     assert (last["treatment"], last["outcome"], last["stage"]) == ("enterprise", "failed", "segment")
-    alone = next(row for row in table if (row["case"], row["treatment"]) == ("a", "silk"))
+    alone = next(row for row in table if (row["case"], row["treatment"]) == ("a", "leo"))
     key = "implant.deployed_length_mm"
     assert float(first[key]) == pytest.approx(alone[key], rel=1e-5)
     study = json.loads((out / "cases" / "first" / "study" / "metrics.json").read_text())
-    (implant,) = study["treatments"]["silk"]["implants"].values()
+    (implant,) = study["treatments"]["leo"]["implants"].values()
     assert implant["deployed_length_mm"] == pytest.approx(alone[key], rel=1e-5)
     page = (out / "cohort.html").read_text()
     assert last["sentence"] in page.replace("&#39;", "'")
-    assert re.findall(r'alt="(.*?)"', page) == ["silk in the artery of first"]  # the other case has no device
+    assert re.findall(r'alt="(.*?)"', page) == ["leo in the artery of first"]  # the other case has no device
     assert main([*command, "--jobs", "2"]) == 0
     assert "0 cases to do" in capsys.readouterr().out
 

@@ -37,12 +37,12 @@ TRUNK, RIGHT, LEFT = range(3)
 
 
 @cache
-def wall(*, sac_at_mm: float | None = None) -> Surface:
+def wall(*, sac_at_mm: float | None = None, edge_mm: float = 0.3) -> Surface:
     """A Y in the plane y = 0, one leg the mirror image of the other, as surface; with a sac on its trunk."""
     fork = phantoms.bifurcation()
     if sac_at_mm is not None:
         fork = phantoms.with_sac(fork, abscissa_mm=sac_at_mm, width_mm=4.0, neck_mm=3.0, direction=np.array([0, 1, 0]))
-    return phantoms.phantom_surface(fork, edge_mm=0.3)
+    return phantoms.phantom_surface(fork, edge_mm=edge_mm)
 
 
 def at_ends(*ends: int) -> Floats:
@@ -317,9 +317,9 @@ def test_a_grid_that_does_not_reach_an_inlet_is_refused() -> None:
 @pytest.fixture(scope="module")
 def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("inlets")
-    write_stl(folder / "y.stl", wall(sac_at_mm=5.0))
+    write_stl(folder / "y.stl", wall(sac_at_mm=5.0, edge_mm=0.7))
     inlets = [f"--inlet={','.join(map(str, end_mm))}" for end_mm in at_ends(RIGHT, LEFT)]
-    words = ["--units", "mm", "--device", "silk", "--grid-spacing", "0.4", "--flow-rate", "3", *inlets]
+    words = ["--units", "mm", "--device", "leo", "--grid-spacing", "0.5", "--flow-rate", "3", *inlets]
     assert main(["run", str(folder / "y.stl"), "--out", str(folder / "first"), *words]) == 0
     return folder / "first"
 
@@ -332,7 +332,7 @@ def test_a_study_keeps_its_inlets_from_the_command_line_to_the_numbers_and_back(
     assert [opening["role"] for opening in openings] == ["inlet", "inlet_2", "outlet_1"]
     for flow in (
         (metrics := json.loads((study / "metrics.json").read_text()))["treatments"]["bare"]["flow"],
-        metrics["treatments"]["silk"]["flow"],
+        metrics["treatments"]["leo"]["flow"],
     ):
         entering = flow["inlet_flow_mL_s"] + flow["inlet_2_flow_mL_s"]
         assert flow["outlet_1_flow_mL_s"] == pytest.approx(entering, rel=1e-3)

@@ -11,8 +11,8 @@ from vstent.flow.lattice.screen import on_grid
 from vstent.flow.media import bands
 from vstent.kernels import directions
 
-SHAPE = np.array([32, 4, 32])
-"""Cells of a box that repeats in all directions."""
+SHAPE = np.array([32, 1, 32])
+"""Cells of a box that repeats in all directions; nothing varies along its second axis."""
 CELL_M, STEP_S = 1e-4, 1.1e-5
 """Those of an artery's flow in cells of 0.1 mm, at its usual time step."""
 VISCOSITY_M2_S, DENSITY_KG_M3 = 0.004 / 1060, 1060.0

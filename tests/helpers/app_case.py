@@ -43,7 +43,7 @@ def served(workspace, path=None):
 
 @cache
 def phantom_surface():
-    return phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.35)
+    return phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.5)
 
 
 def wait(client, case, seconds=300):

@@ -229,11 +229,21 @@ def mesh(vertices: Callable[[], np.ndarray], faces: Callable[[], np.ndarray], *o
     return make
 
 
+@cache
+def slices() -> dict[str, bytes]:
+    """Return the scan as the files of a DICOM series, by name."""
+    with TemporaryDirectory() as folder:
+        write_dicom(scan(), Path(folder, "series"))
+        return {file.name: file.read_bytes() for file in Path(folder, "series").iterdir()}
+
+
 def series(spoil: Callable[[list[Path]], object]) -> Maker:
     """Trace a DICOM series after something was done to its files."""
 
     def make(folder: Path) -> list[str]:
-        write_dicom(scan(), folder / "series")
+        (folder / "series").mkdir()
+        for name, content in slices().items():
+            (folder / "series" / name).write_bytes(content)
         spoil(sorted((folder / "series").iterdir()))
         return ["trace", str(folder / "series"), "--out", "OUT"]
 

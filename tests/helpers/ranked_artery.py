@@ -12,7 +12,7 @@ from vstent.geometry.vessel import Anatomy, Vessel
 def wall() -> Surface:
     """Return its wall."""
     phantom = phantoms.with_sac(phantoms.tube(length_mm=32.0), abscissa_mm=16.0, width_mm=5.0, neck_mm=3.6)
-    return phantoms.phantom_surface(phantom, edge_mm=0.35)
+    return phantoms.phantom_surface(phantom, edge_mm=0.6)
 
 
 @cache

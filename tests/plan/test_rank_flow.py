@@ -203,9 +203,9 @@ def test_the_command_prints_and_writes_the_flows(tmp_path, capsys) -> None:
         "--out",
         str(tmp_path / "out"),
     ]
-    assert main([*command, "--flow", "2", "--jobs", "2", "--grid-spacing", "0.4", "--flow-rate", "1.5"]) == 0
+    assert main([*command, "--flow", "2", "--jobs", "2", "--grid-spacing", "0.6", "--flow-rate", "1.5"]) == 0
     said = capsys.readouterr().out
-    assert "not usable" in said  # 0.4 mm is 9 cells across the neck
+    assert "not usable" in said  # 0.6 mm is 6 cells across the neck
     with (tmp_path / "out" / "ranking.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["rank"] for row in rows[:2]] == ["1", "2"]

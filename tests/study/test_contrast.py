@@ -18,7 +18,7 @@ from vstent.io.archive import load_data
 from vstent.io.writers import write_stl
 from vstent.study.folder import CACHE
 
-SPACING_MM = 0.3
+SPACING_MM = 0.4
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
         neck_mm=3.0,
         direction=np.array([1.0, 0.0, 0.0]),
     )
-    write_stl(folder / "artery.stl", phantoms.phantom_surface(artery, edge_mm=0.35))
+    write_stl(folder / "artery.stl", phantoms.phantom_surface(artery, edge_mm=0.6))
     command = ["flow", str(folder / "artery.stl"), "--out", str(folder / "case"), "--units", "mm"]
     command += ["--grid-spacing", str(SPACING_MM), "--flow-rate", "2"]
     assert main(command) == 0
@@ -51,7 +51,7 @@ def test_an_angiogram_is_written_kept_and_not_computed_twice(
     assert main(["angiogram", str(case), "--window", "5"]) == 0
     said = capsys.readouterr()
     assert "Contrast retention" in said.out
-    assert "cells, grid spacing 0.3 and 0.6 mm" in said.err
+    assert "cells, grid spacing 0.4 and 0.8 mm" in said.err
     measures = bare(case)
     assert before.items() <= measures.items()
     assert measures["contrast_balance_error_fraction"] < 1e-3

@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from vstent.errors import FlowError, InputError, LandingError
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.settings import FlowSettings, Numerics
 from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import Anatomy
 from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_stl
 from vstent.plan.rank import rank
@@ -25,7 +27,7 @@ from vstent.study.keys import implant_keys, study_keys
 from vstent.study.outputs import write_ranking
 from vstent.study.pipeline import refine_flow, restore_vessel, run, trace_vessel
 from vstent.study.settings import AnatomySettings, InputSettings, Settings
-from vstent.study.store import Key
+from vstent.study.store import Key, Store
 
 FLOW = FlowSettings(inflow_mL_s=2.0, numerics=Numerics(cell_size_mm=0.5, max_steps=20))
 
@@ -35,7 +37,8 @@ def of(*devices: str, **more: object) -> Settings:
     return Settings(InputSettings("mm"), treatments=tuple(map(with_device, devices)), **{"flow": None} | more)
 
 
-PLAIN = of("silk")
+PLAIN = of("leo")
+"""Leo and the laser-cut devices have few wires, so that a run is short."""
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +47,7 @@ def arteries(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("arteries")
     for name, length_mm in (("first", 34.0), ("second", 36.0)):
         artery = phantoms.with_sac(phantoms.tube(length_mm=length_mm), abscissa_mm=17.0, width_mm=5.0, neck_mm=3.5)
-        write_stl(folder / f"{name}.stl", phantoms.phantom_surface(artery, edge_mm=0.6))
+        write_stl(folder / f"{name}.stl", phantoms.phantom_surface(artery, edge_mm=0.9))
     return folder / "first.stl", folder / "second.stl"
 
 
@@ -77,31 +80,45 @@ def held(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
-TANDEM = Treatment("tandem", (Implant("a", "silk"), Implant("b", "silk", placing=Placing(shift_mm=2.0), inside=("a",))))
+@pytest.fixture(scope="module")
+def restored(arteries: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Case folder of the first patient with the restored artery alone."""
+    out = tmp_path_factory.mktemp("restored") / "out"
+    restore_vessel(arteries[0], out, PLAIN, quiet)
+    return out
+
+
+@pytest.fixture
+def out(restored: Path, tmp_path: Path) -> Path:
+    """A copy of it, for one test."""
+    return shutil.copytree(restored, tmp_path / "out")
+
+
+TANDEM = Treatment("tandem", (Implant("a", "leo"), Implant("b", "leo", placing=Placing(shift_mm=2.0), inside=("a",))))
 EXISTING = {
     "a device": PLAIN,
-    "two devices": of("silk", "enterprise"),
-    "a device and its flow": of("silk", flow=FLOW),
-    "a size": replace(PLAIN, treatments=(with_device("silk", diameter_mm=4.0, length_mm=20.0),)),
-    "a spread": of("silk", uncertainty=Ranges(samples=2)),
+    "two devices": of("leo", "enterprise"),
+    "a device and its flow": of("leo", flow=FLOW),
+    "a size": replace(PLAIN, treatments=(with_device("leo", diameter_mm=4.5, length_mm=25.0),)),
+    "a spread": of("leo", uncertainty=Ranges(samples=2)),
 }
 COMMANDS = {
-    "another device": of("pipeline"),
+    "another device": of("acclino"),
     "another device and its flow": of("enterprise", flow=FLOW),
     "the same device": PLAIN,
-    "the same device and its flow": of("silk", flow=FLOW),
-    "the same and two in one": replace(PLAIN, treatments=(with_device("silk"), TANDEM)),
-    "another size": replace(PLAIN, treatments=(with_device("silk", diameter_mm=4.0, length_mm=15.0),)),
-    "another flow": of("silk", flow=replace(FLOW, inflow_mL_s=3.0)),
+    "the same device and its flow": of("leo", flow=FLOW),
+    "the same and two in one": replace(PLAIN, treatments=(with_device("leo"), TANDEM)),
+    "another size": replace(PLAIN, treatments=(with_device("leo", diameter_mm=4.5, length_mm=15.0),)),
+    "another flow": of("leo", flow=replace(FLOW, inflow_mL_s=3.0)),
     "less artery": replace(PLAIN, anatomy=AnatomySettings(upstream_mm=12.0)),
-    "another spread": of("silk", uncertainty=Ranges(samples=3)),
+    "another spread": of("leo", uncertainty=Ranges(samples=3)),
 }
 
 
 @pytest.fixture(scope="module")
-def existing(arteries: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def existing(arteries: tuple[Path, Path], restored: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Case folders by what they hold."""
-    folders = {name: tmp_path_factory.mktemp("existing") / "out" for name in EXISTING}
+    folders = {name: shutil.copytree(restored, tmp_path_factory.mktemp("existing") / "out") for name in EXISTING}
     with pytest.MonkeyPatch.context() as patch:
         bare_flow(patch)
         for name, out in folders.items():
@@ -138,10 +155,9 @@ def test_after_any_command_all_that_a_folder_held_is_there_or_the_command_is_ref
 
 @pytest.mark.parametrize("command", [run, restore_vessel, trace_vessel, refine_flow])
 def test_another_input_is_refused_unless_it_is_to_replace(
-    arteries: tuple[Path, Path], tmp_path: Path, command: object
+    arteries: tuple[Path, Path], existing: dict[str, Path], command: object
 ) -> None:
-    out = tmp_path / "out"
-    run(arteries[0], out, PLAIN, quiet)
+    out = existing["a device"]
     before = held(out)
     with pytest.raises(InputError, match=r"results of another input\. Give another --out, or --replace"):
         command(arteries[1], out, PLAIN, quiet)
@@ -160,74 +176,75 @@ def test_treatments_that_a_replacing_command_does_not_name_are_reported(
 
     shutil.copytree(existing["two devices"], out)
     sentence = "removed, because this command does not name them: {}."
-    assert removed(run, arteries[0], of("silk", "enterprise")) == []
-    assert removed(run, arteries[0], of("silk", "pipeline")) == [sentence.format("enterprise")]
+    assert removed(run, arteries[0], of("leo", "enterprise")) == []
+    assert removed(run, arteries[0], of("leo", "acclino")) == [sentence.format("enterprise")]
     assert removed(restore_vessel, arteries[0], PLAIN) == []
-    assert removed(restore_vessel, arteries[1], PLAIN) == [sentence.format("pipeline, silk")]
+    assert removed(restore_vessel, arteries[1], PLAIN) == [sentence.format("acclino, leo")]
     assert not (out / "treatments").exists()
     assert removed(run, arteries[1], PLAIN) == []
 
 
-def test_added_devices_are_what_they_are_in_a_folder_of_their_own(arteries: tuple[Path, Path], tmp_path: Path) -> None:
-    out, anew = tmp_path / "out", tmp_path / "anew"
-    run(arteries[0], out, of("silk", flow=FLOW), quiet)
+def test_added_devices_are_what_they_are_in_a_folder_of_their_own(
+    arteries: tuple[Path, Path], out: Path, restored: Path, tmp_path: Path
+) -> None:
+    anew = shutil.copytree(restored, tmp_path / "anew")
+    run(arteries[0], out, of("leo", flow=FLOW), quiet)
     run(arteries[0], out, of("enterprise", flow=FLOW), quiet)
-    run(arteries[0], anew, of("silk", "enterprise", flow=FLOW), quiet)
+    run(arteries[0], anew, of("leo", "enterprise", flow=FLOW), quiet)
     assert (out / "metrics.json").read_bytes() == (anew / "metrics.json").read_bytes()
 
 
 def test_a_device_added_without_flow_gets_none_and_the_flows_stay(
-    arteries: tuple[Path, Path], tmp_path: Path, bare_flow_for_all: list[str]
+    arteries: tuple[Path, Path], out: Path, bare_flow_for_all: list[str]
 ) -> None:
-    out = tmp_path / "out"
-    run(arteries[0], out, of("silk", flow=FLOW), quiet)
-    case = run(arteries[0], out, of("pipeline"), quiet)
+    run(arteries[0], out, of("leo", flow=FLOW), quiet)
+    case = run(arteries[0], out, of("acclino"), quiet)
     assert bare_flow_for_all == ["bare", "device"]
-    assert set(case.fields) == {"bare", "silk"}
-    assert set(case.implants) == {"silk", "pipeline"}
-    assert "flow" not in case.metrics["treatments"]["pipeline"]
-    later = run(arteries[0], out, of("pipeline", flow=FLOW), quiet)
+    assert set(case.fields) == {"bare", "leo"}
+    assert set(case.implants) == {"leo", "acclino"}
+    assert "flow" not in case.metrics["treatments"]["acclino"]
+    later = run(arteries[0], out, of("acclino", flow=FLOW), quiet)
     assert bare_flow_for_all == ["bare", "device", "device"]
-    assert set(later.fields) == {"bare", "silk", "pipeline"}
+    assert set(later.fields) == {"bare", "leo", "acclino"}
 
 
 def test_a_device_that_does_not_fit_is_a_row_with_its_reason(
-    arteries: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    arteries: tuple[Path, Path], out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = of("silk", "enterprise")
+    settings = of("leo", "enterprise")
     real = stages.deploy_implant
 
     def too_long(implant: Implant, *given: object) -> object:
-        if implant.device == "silk":
-            raise LandingError("No size of Silk fits: choose another device.")
+        if implant.device == "leo":
+            raise LandingError("No size of Leo fits: choose another device.")
         return real(implant, *given)
 
     monkeypatch.setattr(stages, "deploy_implant", too_long)
-    case = run(arteries[0], tmp_path / "out", settings, quiet)
+    case = run(arteries[0], out, settings, quiet)
     assert set(case.implants) == {"enterprise"}
-    assert case.failures == {"silk": "not deployed: No size of Silk fits: choose another device."}
-    assert json.loads((tmp_path / "out" / "metrics.json").read_text())["failures"] == case.failures
-    assert case.notes[0] == f"silk: {case.failures['silk']}"
-    with pytest.raises(LandingError, match=r"^silk: No size of Silk"):
+    assert case.failures == {"leo": "not deployed: No size of Leo fits: choose another device."}
+    assert json.loads((out / "metrics.json").read_text())["failures"] == case.failures
+    assert case.notes[0] == f"leo: {case.failures['leo']}"
+    with pytest.raises(LandingError, match=r"^leo: No size of Leo"):
         run(arteries[0], tmp_path / "none", PLAIN, quiet)
     assert not (tmp_path / "none").exists()
 
 
 def test_a_flow_that_diverges_is_a_row_with_its_reason(
-    arteries: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    arteries: tuple[Path, Path], out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings, real = of("silk", "enterprise", flow=FLOW), stages.simulate_case
+    settings, real = of("leo", "enterprise", flow=FLOW), stages.simulate_case
 
     def diverging(case: FlowCase, **given: object) -> FlowField:
-        if case.solids and case.solids[0].design.key == "silk":
+        if case.solids and case.solids[0].design.key == "leo":
             raise FlowError("the flow diverged: use a finer grid spacing")
         return real(case, **given)
 
     monkeypatch.setattr(stages, "simulate_case", diverging)
-    case = run(arteries[0], tmp_path, settings, quiet)
+    case = run(arteries[0], out, settings, quiet)
     assert set(case.fields) == {"bare", "enterprise"}
-    assert case.failures == {"silk": "flow not computed: the flow diverged: use a finer grid spacing"}
-    assert case.metrics["treatments"]["silk"].keys() == {"implants"}
+    assert case.failures == {"leo": "flow not computed: the flow diverged: use a finer grid spacing"}
+    assert case.metrics["treatments"]["leo"].keys() == {"implants"}
 
 
 def test_keys_change_with_what_a_stage_uses_and_with_nothing_else() -> None:
@@ -274,7 +291,7 @@ def test_a_folder_of_an_older_version_is_refused_and_nothing_in_it_is_touched(
     arteries: tuple[Path, Path], tmp_path: Path, states: str, command: object
 ) -> None:
     (tmp_path / CACHE).mkdir()
-    (tmp_path / states).write_text('{"path": "artery.stl", "sha256": "0", "settings": {"devices": ["silk"]}}')
+    (tmp_path / states).write_text('{"path": "artery.stl", "sha256": "0", "settings": {"devices": ["leo"]}}')
     (tmp_path / CACHE / ".partial-0-1.npz").write_text("half")
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
     for replaces in (False, True):
@@ -283,17 +300,33 @@ def test_a_folder_of_an_older_version_is_refused_and_nothing_in_it_is_touched(
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
 
 
-@pytest.mark.parametrize("damage", ["", "[]", "{", '{"seconds": 1}', '{"seconds": {"a": "b"}}', 9999 * "[", "\0\xff"])
+DAMAGES = ("", "[]", "{", '{"seconds": 1}', '{"seconds": {"a": "b"}}', 9999 * "[", "\0\xff")
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_or_foreign_record_is_none(tmp_path: Path, damage: str) -> None:
+    store, key = Store(tmp_path), Key("given", "code")
+    store.path("measure", key).write_text(damage)
+    store.path("measure", key, ".json").write_text(damage)
+    assert store.record("measure", key) == {}
+    assert store.find("measure", key, Anatomy) is None
+    assert store.compute_once("measure", key, lambda: {"new": 1.0}) == {"new": 1.0}
+    assert store.load("measure", key, Anatomy) is None  # the record is whole again, the archive is not
+    assert store.compute_once("measure", key, lambda: {"newer": 1.0}) == {"new": 1.0}
+
+
+@pytest.mark.parametrize("suffixes", [(".json", ".npz"), (".npz",)])
 def test_a_damaged_or_foreign_file_is_computed_again(
-    arteries: tuple[Path, Path], existing: dict[str, Path], tmp_path: Path, damage: str
+    arteries: tuple[Path, Path], existing: dict[str, Path], tmp_path: Path, suffixes: tuple[str, ...]
 ) -> None:
     out, computed = tmp_path / "out", []
     shutil.copytree(existing["a device"], out)
-    metrics, kept = (out / "metrics.json").read_bytes(), [*(out / CACHE).glob("*-*-*.*")]
-    for path in kept:
+    metrics, kept = (out / "metrics.json").read_bytes(), sorted((out / CACHE).glob("*-*-*.*"))
+    for damage, path in zip(cycle(DAMAGES), (path for path in kept if path.suffix in suffixes), strict=False):
         path.write_text(damage)
     run(arteries[0], out, PLAIN, lambda now: computed.append(now.stage) if now.detail != "already done" else None)
-    assert {"segment", "trace", "trim", "restore", "deploy silk", "struts silk", "measure"} <= {*computed}
+    of_files = {"struts leo", "measure"} if ".json" in suffixes else set()
+    assert {"segment", "trace", "trim", "restore", "deploy leo"} | of_files <= {*computed}
     assert (out / "metrics.json").read_bytes() == metrics
     assert {path.name for path in (out / CACHE).glob("*-*-*.*")} == {path.name for path in kept}
     computed.clear()
@@ -302,14 +335,14 @@ def test_a_damaged_or_foreign_file_is_computed_again(
 
 
 def test_a_ranking_of_another_device_keeps_the_rows_of_the_former_one(
-    arteries: tuple[Path, Path], tmp_path: Path
+    arteries: tuple[Path, Path], out: Path, tmp_path: Path
 ) -> None:
-    anatomy, _ = restore_vessel(arteries[0], tmp_path / "out", PLAIN, quiet)
-    designs = [replace(find_design(name), sizes=find_design(name).sizes[:3]) for name in ("silk", "leo")]
+    anatomy, _ = restore_vessel(arteries[0], out, PLAIN, quiet)
+    designs = [replace(find_design(name), sizes=find_design(name).sizes[:2]) for name in ("acclino", "leo")]
     for design in designs:
-        write_ranking(tmp_path / "out", rank(anatomy, [design]))
+        write_ranking(out, rank(anatomy, [design]))
     write_ranking(tmp_path, rank(anatomy, designs))
-    assert (tmp_path / "out" / "ranking.csv").read_text() == (tmp_path / "ranking.csv").read_text()
+    assert (out / "ranking.csv").read_text() == (tmp_path / "ranking.csv").read_text()
 
 
 def test_a_point_in_another_frame_is_recognized(arteries: tuple[Path, Path], tmp_path: Path) -> None:

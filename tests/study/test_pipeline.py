@@ -1,6 +1,7 @@
 """What a study writes, and that one stopped in the middle of a flow goes on from there."""
 
 import json
+import shutil
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
@@ -27,7 +28,7 @@ from vstent.io.surfaces import read_surface
 from vstent.io.writers import write_stl
 from vstent.study import stages
 from vstent.study.crate import write_crate
-from vstent.study.folder import implant_folder
+from vstent.study.folder import CACHE, implant_folder
 from vstent.study.keys import hash_of, study_keys
 from vstent.study.outputs import write_anatomy
 from vstent.study.pipeline import restore_vessel, run, trace_vessel
@@ -113,16 +114,27 @@ def arteries(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("arteries")
     for name, length_mm in (("first", 24.0), ("second", 26.0)):
         artery = phantoms.with_sac(phantoms.tube(length_mm=length_mm), abscissa_mm=12.0, width_mm=5.0, neck_mm=3.5)
-        write_stl(folder / f"{name}.stl", phantoms.phantom_surface(artery, edge_mm=0.6))
+        write_stl(folder / f"{name}.stl", phantoms.phantom_surface(artery, edge_mm=0.9))
     return folder / "first.stl", folder / "second.stl"
 
 
+@pytest.fixture(scope="module")
+def stored(arteries: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Case folders of both in which nothing but their stored vessel and restored artery lies."""
+    folders = tuple(tmp_path_factory.mktemp("stored") / path.stem for path in arteries)
+    for path, folder in zip(arteries, folders, strict=True):
+        restored = tmp_path_factory.mktemp("restored") / "out"
+        restore_vessel(path, restored, settings_of(), lambda *_: None)
+        shutil.copytree(restored / CACHE, folder / CACHE)
+    return folders
+
+
 RESULTS_OF_ONE = (
-    *("report.pdf", "ranking.csv", "treatments/bare/flow/field.vtu", "treatments/silk/flow/wall.vtp"),
+    *("report.pdf", "ranking.csv", "treatments/bare/flow/field.vtu", "treatments/leo/flow/wall.vtp"),
     *("treatments/bare/flow/openfoam/vstent.key", "treatments/bare/flow/openfoam/system/controlDict"),
 )
 OF_THE_USER = (
-    *("notes.txt", "treatments/silk/implants/silk/mine.vtp", "treatments/my.stl"),
+    *("notes.txt", "treatments/leo/implants/leo/mine.vtp", "treatments/my.stl"),
     "treatments/mine/flow/case/field.vtu",
 )
 
@@ -140,16 +152,16 @@ def shown(folder: Path) -> set[str]:
 
 @pytest.mark.parametrize("knows", ["input.json", "run.json"])
 def test_a_folder_replaced_by_another_patient_s_holds_nothing_of_the_former(
-    arteries: tuple[Path, Path], tmp_path: Path, knows: str
+    arteries: tuple[Path, Path], stored: tuple[Path, Path], tmp_path: Path, knows: str
 ) -> None:
     first, second = arteries
-    out = tmp_path / "out"
-    settings = settings_of("silk")
+    out, anew = shutil.copytree(stored[0], tmp_path / "out"), shutil.copytree(stored[1], tmp_path / "anew")
+    settings = settings_of("leo")
     run(first, out, settings, lambda *_: None)
     for name in (*RESULTS_OF_ONE, *OF_THE_USER):
         (out / name).parent.mkdir(parents=True, exist_ok=True)
         (out / name).write_text("of the first")
-    (out / ".vstent" / "flow silk-1234.npz").write_text("kept")
+    (out / ".vstent" / "flow leo-1234.npz").write_text("kept")
     if knows == "run.json":
         (out / ".vstent" / "input.json").unlink()
     before = {name: (out / name).read_bytes() for name in shown(out)}
@@ -157,7 +169,7 @@ def test_a_folder_replaced_by_another_patient_s_holds_nothing_of_the_former(
         run(
             second,
             out,
-            replace(settings, treatments=(with_device("silk", length_mm=1e3),)),
+            replace(settings, treatments=(with_device("leo", length_mm=1e3),)),
             lambda *_: None,
             replaces=True,
         )
@@ -165,19 +177,21 @@ def test_a_folder_replaced_by_another_patient_s_holds_nothing_of_the_former(
 
     again = settings_of("enterprise")
     run(second, out, again, lambda *_: None, replaces=True)
-    run(second, tmp_path / "anew", again, lambda *_: None, replaces=True)
-    assert shown(out) == shown(tmp_path / "anew") | set(OF_THE_USER)
-    assert (out / "vessel.vtp").read_bytes() == (tmp_path / "anew" / "vessel.vtp").read_bytes()
-    assert (out / ".vstent" / "flow silk-1234.npz").read_text() == "kept"
+    run(second, anew, again, lambda *_: None, replaces=True)
+    assert shown(out) == shown(anew) | set(OF_THE_USER)
+    assert (out / "vessel.vtp").read_bytes() == (anew / "vessel.vtp").read_bytes()
+    assert (out / ".vstent" / "flow leo-1234.npz").read_text() == "kept"
 
 
 def test_the_same_patient_keeps_what_was_found_and_another_one_that_replaces_it_does_not(
-    arteries: tuple[Path, Path], tmp_path: Path
+    arteries: tuple[Path, Path], stored: tuple[Path, Path], tmp_path: Path
 ) -> None:
     first, second = arteries
+    for folder, name in zip(stored, ("out", "anew"), strict=True):
+        shutil.copytree(folder, tmp_path / name)
     moved = tmp_path / "moved.stl"
     moved.write_bytes(first.read_bytes())
-    settings = settings_of("silk")
+    settings = settings_of("leo")
     run(first, tmp_path / "out", settings, lambda *_: None)
     (tmp_path / "out" / "report.pdf").write_text("of the first")
     before = shown(tmp_path / "out")
@@ -190,11 +204,11 @@ def test_the_same_patient_keeps_what_was_found_and_another_one_that_replaces_it_
 
 
 def test_a_folder_replaced_with_other_settings_holds_nothing_of_the_former(
-    arteries: tuple[Path, Path], tmp_path: Path
+    arteries: tuple[Path, Path], stored: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    out, anew = tmp_path / "out", tmp_path / "anew"
+    out, anew = (shutil.copytree(stored[0], tmp_path / name) for name in ("out", "anew"))
     foam = FlowSettings(numerics=Numerics(cell_size_mm=0.5, engine="openfoam"))
-    former = settings_of("silk", "enterprise", flow=foam)
+    former = settings_of("leo", "enterprise", flow=foam)
     written_by_openfoam = [*engine_folders(out, former).values(), out / "convergence" / "openfoam" / "grid"]
     run(arteries[0], out, replace(former, flow=None), lambda *_: None, replaces=True)
     restore_vessel(arteries[0], out, former, lambda *_: None)
@@ -209,7 +223,7 @@ def test_a_folder_replaced_with_other_settings_holds_nothing_of_the_former(
         run(
             arteries[0],
             out,
-            replace(former, flow=None, treatments=(with_device("silk", length_mm=1e3),)),
+            replace(former, flow=None, treatments=(with_device("leo", length_mm=1e3),)),
             lambda *_: None,
             replaces=True,
         )
@@ -227,9 +241,9 @@ def test_a_folder_replaced_with_other_settings_holds_nothing_of_the_former(
 
 
 def test_stopped_while_replacing_a_folder_holds_nothing_of_the_former_beside_the_new_flow(
-    arteries: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    arteries: tuple[Path, Path], stored: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out, computed = tmp_path / "out", []
+    out, computed = shutil.copytree(stored[0], tmp_path / "out"), []
     real = stages.simulate_case
     stops = {"of": None}
 
@@ -241,7 +255,7 @@ def test_stopped_while_replacing_a_folder_holds_nothing_of_the_former_beside_the
 
     monkeypatch.setattr(stages, "simulate_case", counted)
     flow = FlowSettings(inflow_mL_s=1.0, numerics=Numerics(cell_size_mm=0.5, max_steps=20))
-    slow = settings_of("silk", flow=flow)
+    slow = settings_of("leo", flow=flow)
     fast = replace(slow, flow=replace(slow.flow, inflow_mL_s=3.0))
     run(arteries[0], out, slow, lambda *_: None, replaces=True)
     (out / "report.html").write_text("of the slow flow")
@@ -250,7 +264,7 @@ def test_stopped_while_replacing_a_folder_holds_nothing_of_the_former_beside_the
     run(arteries[0], out, slow, lambda *_: None, replaces=True)  # the same again: everything stays
     assert shown(out) == whole
     again = json.loads((out / "run.json").read_text())["seconds"]
-    assert {"segment", "trace", "trim", "restore", "deploy silk", "struts silk", "measure"} < set(first)
+    assert {"segment", "trace", "trim", "restore", "deploy leo", "struts leo", "measure"} < set(first)
     assert again == first  # nothing was computed anew
 
     stops["of"] = 3.0
@@ -281,12 +295,15 @@ def test_what_is_kept_damaged_is_found_anew_and_replaced(arteries: tuple[Path, P
     assert stages_told() == {"anatomy"}
 
 
-def test_a_crate_does_not_outlive_what_it_describes(arteries: tuple[Path, Path], tmp_path: Path) -> None:
-    settings = settings_of("silk")
-    case = run(arteries[0], tmp_path, settings, lambda *_: None)
-    write_crate(tmp_path, case.provenance, "2026-01-01")
-    run(arteries[0], tmp_path, settings, lambda *_: None)
-    assert "ro-crate-metadata.json" not in shown(tmp_path)
+def test_a_crate_does_not_outlive_what_it_describes(
+    arteries: tuple[Path, Path], stored: tuple[Path, Path], tmp_path: Path
+) -> None:
+    settings, out = settings_of("leo"), shutil.copytree(stored[0], tmp_path / "out")
+    case = run(arteries[0], out, settings, lambda *_: None)
+    write_crate(out, case.provenance, "2026-01-01")
+    assert "ro-crate-metadata.json" in shown(out)
+    run(arteries[0], out, settings, lambda *_: None)
+    assert "ro-crate-metadata.json" not in shown(out)
 
 
 def test_trimmed_otherwise_the_vessel_is_the_one_that_was_traced_and_the_result_the_same(tmp_path: Path) -> None:
@@ -318,18 +335,21 @@ def test_of_two_vessels_in_one_surface_the_one_at_the_point_given_is_taken(tmp_p
 
 
 def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    arteries: tuple[Path, Path],
+    stored: tuple[Path, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    artery, out = tmp_path / "artery.stl", tmp_path / "out"
-    write_stl(artery, phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.35))
-    command = ["run", str(artery), "--out", str(out), "--device", "silk", "--grid-spacing", "0.25"]
+    out = shutil.copytree(stored[0], tmp_path / "out")
+    command = ["run", str(arteries[0]), "--out", str(out), "--units", "mm", "--device", "leo", "--grid-spacing", "0.35"]
     real, computed = stages.simulate_case, []
 
     def stopped_with_a_stent(case: FlowCase, *, start: FlowField | None, **given: object) -> FlowField:
-        if case.media and not computed.count("silk"):
-            computed.append("silk")
+        if case.media and not computed.count("leo"):
+            computed.append("leo")
             raise KeyboardInterrupt
-        computed.append("silk" if case.media else "bare")
+        computed.append("leo" if case.media else "bare")
         return start if start is not None else real(case, start=start, **given)
 
     monkeypatch.setattr(stages, "simulate_case", stopped_with_a_stent)
@@ -338,29 +358,29 @@ def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(
     assert (out / "treatments" / "bare" / "flow" / "field.vtu").stat().st_size > 100_000
     assert not (out / "metrics.json").exists()
     assert main(command) == 0
-    assert computed == ["bare", "silk", "silk"]
+    assert computed == ["bare", "leo", "leo"]
     metrics = json.loads((out / "metrics.json").read_text())
     # The second run was handed the bare flow: nothing changed, and every ratio is 1.
-    bare, silk = (metrics["treatments"][name] for name in ("bare", "silk"))
-    assert silk["change"]["neck_inflow_mL_s_ratio"] == pytest.approx(1.0)
+    bare, leo = (metrics["treatments"][name] for name in ("bare", "leo"))
+    assert leo["change"]["neck_inflow_mL_s_ratio"] == pytest.approx(1.0)
     assert bare["flow"]["neck_inflow_mL_s"] == pytest.approx(bare["flow"]["neck_outflow_mL_s"], rel=0.1)
     report = (out / "report.html").read_text()
-    assert all(f"Flow, {name}: The flow has " in report for name in ("bare", "silk"))
+    assert all(f"Flow, {name}: The flow has " in report for name in ("bare", "leo"))
     left = bare["flow"]["unsettled_fraction"]
     assert (left < 0.01) == ("Flow, bare: The flow has converged" in report)
-    assert silk["flow"]["unsettled_fraction"] == left > 0
-    assert not any("unsettled" in key for key in silk["change"])
+    assert leo["flow"]["unsettled_fraction"] == left > 0
+    assert not any("unsettled" in key for key in leo["change"])
     provenance = json.loads((out / "run.json").read_text())
     assert len(provenance["input"]["sha256"]) == 64
     assert {"numpy", "vstent", "python"} <= set(provenance["versions"])
 
 
 def test_on_a_gpu_a_flow_is_stored_while_the_next_is_computed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = settings_of("silk", flow=FlowSettings(numerics=Numerics(device_gpu=True)))
+    settings = settings_of("leo", flow=FlowSettings(numerics=Numerics(device_gpu=True)))
     is_next_begun, threads, stored = Event(), set(), []
 
     def computed(case: str, *, start: object, **given: object) -> SimpleNamespace:
-        if case == "silk":
+        if case == "leo":
             is_next_begun.set()
         return SimpleNamespace(name=case, start=start, advice="")
 
@@ -379,47 +399,52 @@ def test_on_a_gpu_a_flow_is_stored_while_the_next_is_computed(tmp_path: Path, mo
     monkeypatch.setattr(stages, "write_field", written)
     monkeypatch.setattr("vstent.io.archive.save_data", lambda *_: None)
     monkeypatch.setattr(Store, "write", write)
-    silk = {"silk": SimpleNamespace(stent=SimpleNamespace(name="silk"))}
+    leo = {"leo": SimpleNamespace(stent=SimpleNamespace(name="leo"))}
     store, keys = Store(tmp_path / "cache"), study_keys("", settings)
-    fields, failures = stages.compute_flows(tmp_path, None, {"silk": silk}, settings, store, keys)
+    fields, failures = stages.compute_flows(tmp_path, None, {"leo": leo}, settings, store, keys)
     assert not failures
-    assert fields["silk"].start is fields["bare"]
+    assert fields["leo"].start is fields["bare"]
     assert get_ident() not in threads
     # The run time stored with a flow is its own, though the next one was begun before it was stored.
     assert stored == [
         *(("flow bare", ["flow bare"]), "treatments/bare/flow"),
-        *(("flow silk", ["flow silk"]), "treatments/silk/flow"),
+        *(("flow leo", ["flow leo"]), "treatments/leo/flow"),
     ]
 
 
+NARROW = ((16, 40.0),)
+"""Wires of another Leo: number and diameter in um."""
+
+
 def test_a_device_whose_wires_change_does_not_get_the_flow_of_the_former(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    arteries: tuple[Path, Path], stored: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    artery, out = tmp_path / "artery.stl", tmp_path / "out"
-    write_stl(artery, phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.35))
+    artery, out = arteries[0], shutil.copytree(stored[0], tmp_path / "out")
     real, computed = stages.simulate_case, []
-    design = find_design("silk")
+    design = find_design("leo")
 
     def computed_once(case: FlowCase, *, start: FlowField | None, **given: object) -> FlowField:
         computed.append(case.solids[0].design.wires if case.solids else ())
         return start if start is not None else real(case, start=start, **given)
 
     monkeypatch.setattr(stages, "simulate_case", computed_once)
-    settings = settings_of("silk", flow=FlowSettings(numerics=Numerics(cell_size_mm=0.35)))
+    settings = settings_of("leo", flow=FlowSettings(numerics=Numerics(cell_size_mm=0.5, max_steps=20)))
     run(artery, out, settings, lambda *_: None)
     for module in ("stages", "keys"):
-        monkeypatch.setattr(f"vstent.study.{module}.find_design", lambda _: replace(design, wires=((48, 40.0),)))
+        monkeypatch.setattr(f"vstent.study.{module}.find_design", lambda _: replace(design, wires=NARROW))
     run(artery, out, settings, lambda *_: None)
     run(artery, out, settings, lambda *_: None)
-    assert computed == [(), design.wires, ((48, 40.0),)]
+    assert computed == [(), design.wires, NARROW]
 
 
-def test_what_has_changed_is_written_again_and_nothing_else(arteries: tuple[Path, Path], tmp_path: Path) -> None:
-    out, settings = tmp_path / "out", settings_of("silk", "enterprise")
+def test_what_has_changed_is_written_again_and_nothing_else(
+    arteries: tuple[Path, Path], stored: tuple[Path, Path], tmp_path: Path
+) -> None:
+    out, settings = shutil.copytree(stored[0], tmp_path / "out"), settings_of("leo", "enterprise")
     first = run(arteries[0], out, settings, lambda *_: None)
     files = {path: path.read_bytes() for path in out.glob("treatments/*/implants/*/*")}
     dates = {path: path.stat().st_mtime_ns for path in files}
-    implant_folder(out, "silk", "silk").joinpath("struts.stl").write_text("of the user")
+    implant_folder(out, "leo", "leo").joinpath("struts.stl").write_text("of the user")
     implant_folder(out, "enterprise", "enterprise").joinpath("wires.vtp").unlink()
     (measured,) = (out / ".vstent").glob("measure-*.json")
     measured.write_text("{damaged")
@@ -428,9 +453,9 @@ def test_what_has_changed_is_written_again_and_nothing_else(arteries: tuple[Path
     assert all(path.stat().st_mtime_ns > dates[path] for path in files)
     run(arteries[0], out, settings, lambda *_: None)
     third = run(arteries[0], out, settings, lambda *_: None)
-    assert list(third.metrics["treatments"]) == list(first.metrics["treatments"]) == ["silk", "enterprise"]
+    assert list(third.metrics["treatments"]) == list(first.metrics["treatments"]) == ["leo", "enterprise"]
     assert third.metrics == json.loads(json.dumps(second.metrics)) == json.loads(json.dumps(first.metrics))
-    before, after = (case.implants["silk"]["silk"].stent.nodes_mm for case in (first, third))
+    before, after = (case.implants["leo"]["leo"].stent.nodes_mm for case in (first, third))
     np.testing.assert_array_equal(after, before)
     dates = {path: path.stat().st_mtime_ns for path in files}
     run(arteries[0], out, settings, lambda *_: None)

@@ -33,9 +33,9 @@ def case(tmp_path_factory):
     """A run with settings that seven digits do not hold, a coarse flow, and varied causes."""
     folder = tmp_path_factory.mktemp("repeat")
     artery = phantoms.with_sac(phantoms.tube(length_mm=24), abscissa_mm=12, width_mm=5.0, neck_mm=3.5)
-    write_stl(folder / "ä scan.stl", phantoms.phantom_surface(artery, edge_mm=0.45))
-    options = ["--units", "mm", "--device", "silk", "--at=0.1234567891,3,12", "--center", "12.000000123"]
-    flow = ["--grid-spacing", "0.333333333333", "--flow-rate", "2.7182818284590"]
+    write_stl(folder / "ä scan.stl", phantoms.phantom_surface(artery, edge_mm=0.8))
+    options = ["--units", "mm", "--device", "leo", "--at=0.1234567891,3,12", "--center", "12.000000123"]
+    flow = ["--grid-spacing", "0.444444444444", "--flow-rate", "2.7182818284590"]
     varied = ["--uncertainty", "2", "--vary-landing", "0.1"]
     command = ["run", str(folder / "ä scan.stl"), "--out", str(folder / "first"), *options, *flow, *varied]
     assert main(command) == 0
@@ -49,14 +49,14 @@ def test_a_repeated_run_is_the_same_to_the_last_bit(case, capsys):
     assert "Not as then" not in said.err
     assert "already done" not in said.err
     first, again = case / "first", case / "again"
-    of_silk = ("treatments/silk/implants/silk/wires.vtp", "treatments/silk/flow/wall.vtp")
-    for name in ("metrics.json", "vessel.vtp", *of_silk, "treatments/bare/flow/field.vtu"):
+    of_leo = ("treatments/leo/implants/leo/wires.vtp", "treatments/leo/flow/wall.vtp")
+    for name in ("metrics.json", "vessel.vtp", *of_leo, "treatments/bare/flow/field.vtu"):
         assert (first / name).read_bytes() == (again / name).read_bytes()
     one, other = (json.loads((folder / "run.json").read_text()) for folder in (first, again))
     assert one["settings"] == other["settings"]
     (treatment,) = one["settings"]["treatments"]
     assert treatment["implants"][0]["placing"]["position_mm"] == 12.000000123
-    assert one["settings"]["flow"]["numerics"]["cell_size_mm"] == 0.333333333333
+    assert one["settings"]["flow"]["numerics"]["cell_size_mm"] == 0.444444444444
     _check_crate(again)
 
 
@@ -101,12 +101,12 @@ def test_another_input_is_refused_and_a_moved_one_is_found(case, tmp_path, capsy
 def test_other_versions_and_devices_are_told(case):
     told = json.loads((case / "first" / "run.json").read_text())
     told["versions"]["numpy"] = "1.0"
-    told["devices"]["silk"] = "other wires"
+    told["devices"]["leo"] = "other wires"
     del told["machine"]
     (case / "first" / "other.json").write_text(json.dumps(told))
     differences = repeating.read_record(case / "first" / "other.json").differences
     assert any("numpy (versions): 1.0 before" in sentence for sentence in differences)
-    assert any("silk (devices): other wires before" in sentence for sentence in differences)
+    assert any("leo (devices): other wires before" in sentence for sentence in differences)
     assert sum("(machine): absent before" in sentence for sentence in differences) == 2
     assert len(differences) == 4
     (case / "first" / "other.json").unlink()

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import cache
 
+import numba
 import numpy as np
 import pytest
 from shapes import sphere
@@ -86,6 +87,16 @@ def with_septa(domain, rng):
     return replace(domain, septum_cell=cell, septum_direction=2 * pair + 1)
 
 
+@pytest.fixture
+def all_threads():
+    """Let the kernels run on as many threads as there are cores."""
+    before = numba.get_num_threads()
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    yield
+    numba.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("all_threads")
 @pytest.mark.parametrize("threads", [1, 2, 5, 64])
 def test_a_band_is_done_when_all_that_it_needs_is(threads):
     """Whatever the bands and whoever does them: as if every stage were done everywhere first.
@@ -116,6 +127,18 @@ def test_a_band_is_done_when_all_that_it_needs_is(threads):
         f = state.populations.copy()
         d3q19.update(f, cells, back, bands, shares)
         found.append(f)
+    np.testing.assert_array_equal(*found)
+
+
+@pytest.mark.usefixtures("all_threads")
+def test_a_flow_has_the_same_bits_on_one_thread_and_on_all():
+    found = []
+    for threads in (1, numba.config.NUMBA_NUM_THREADS):
+        numba.set_num_threads(threads)
+        state = LatticeBoltzmann(0.3).init(bend(), None)
+        advance(state, 200)
+        assert state.populations.any()
+        found.append(state.populations)
     np.testing.assert_array_equal(*found)
 
 

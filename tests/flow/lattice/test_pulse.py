@@ -25,22 +25,20 @@ from vstent.geometry.vessel import Vessel
 
 
 @cache
-def pulsing(cell_size_mm: float = 0.25) -> FlowField:
+def pulsing(cell_size_mm: float, max_cycles: int = 4) -> FlowField:
     vessel = trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=14.0, radius_mm=2.0))))
     inflow_mL_s = MEAN_MEAN_M_S * np.pi * RADIUS_M**2 * 1e6
-    settings = FlowSettings(
-        inflow_mL_s=inflow_mL_s, waveform=PULSE, numerics=Numerics(cell_size_mm=cell_size_mm, lattice_speed=0.05)
-    )
+    numerics = Numerics(cell_size_mm=cell_size_mm, lattice_speed=0.05, max_cycles=max_cycles)
+    settings = FlowSettings(inflow_mL_s=inflow_mL_s, waveform=PULSE, numerics=numerics)
     return simulate_case(vessel_case(vessel, settings))
 
 
-@cache
 def in_steps(longer: float) -> FlowField:
-    """The same in steps that are by turns the shortest and so many times as long."""
+    """The same on wide cells, in steps that are by turns the shortest and so many times as long."""
     with pytest.MonkeyPatch.context() as patch:
-        steps = 2 * np.rint(400 / np.tile([1, longer], PHASES // 2)).astype(int)
+        steps = 2 * np.rint(200 / np.tile([1, longer], PHASES // 2)).astype(int)
         patch.setattr(lattice_engine, "pace", lambda *case: steps)
-        return pulsing.__wrapped__()
+        return pulsing.__wrapped__(0.4, max_cycles=2)
 
 
 def along(field: FlowField) -> float:
@@ -67,11 +65,11 @@ def test_velocity_is_womersleys_at_every_phase(cell_size_mm: float, of_peak: flo
 
 
 def test_a_pulse_that_begins_from_a_coarser_one_soon_repeats(monkeypatch: pytest.MonkeyPatch) -> None:
-    at_rest = pulsing()  # the tube holds too few wider cells for a guess
+    at_rest = pulsing(0.25)  # the tube holds too few wider cells for a guess
     for module in (flow, domain):
         monkeypatch.setattr(module, "MIN_CELLS", 20)
     second = 2 * PHASES - 1
-    assert pulsing.__wrapped__().residual[second] < 0.05 * at_rest.residual[second]
+    assert pulsing.__wrapped__(0.25, max_cycles=2).residual[second] < 0.05 * at_rest.residual[second]
 
 
 def fast(speed_m_s: np.ndarray) -> float:
@@ -84,7 +82,7 @@ SWING_OF_HALF = Waveform(1.0, (0.5,), (0.0,))
 
 def steps_of(waveform: Waveform, speed_m_s: np.ndarray | None, way_mm: float = 1e-6) -> np.ndarray:
     """Steps of every phase of a pulse whose blood is that fast at the end of each; None: that is not known."""
-    field = pulsing()
+    field = pulsing(0.25)
     case = vessel_case(
         trace(Vessel(field.wall)), FlowSettings(waveform=waveform, numerics=Numerics(lattice_speed=0.05))
     )
@@ -116,7 +114,7 @@ def test_time_steps_go_by_the_fastest_blood_of_their_phase() -> None:
 def test_where_no_cycle_is_known_blood_is_faster_as_the_flow_is_and_goes_on_for_a_phase() -> None:
     flow = 1 + 0.5 * np.cos(2 * np.pi * np.arange(PHASES + 1) / PHASES)
     within = np.maximum(flow[1:], flow[:-1])
-    expected = 1.1 * fast(pulsing().speed_m_s) * np.maximum(within, np.roll(within, 1)) / PHASES / (0.05 * 0.25e-3)
+    expected = 1.1 * fast(pulsing(0.25).speed_m_s) * np.maximum(within, np.roll(within, 1)) / PHASES / (0.05 * 0.25e-3)
     found = steps_of(SWING_OF_HALF, None)
     np.testing.assert_allclose(found, np.maximum(expected, expected.max() / 3), atol=2.01)
 
@@ -145,9 +143,9 @@ def test_a_flow_goes_on_as_it_was_when_the_steps_change() -> None:
     assert changing.steps == pytest.approx(0.9 * shorter.steps, rel=0.01)
     inside, along_wall = ((z > 1) & (z < 13) for z in (shorter.centers_mm[:, 2], shorter.wall.vertices_mm[:, 2]))
     limits = {
-        "velocity_m_s": (inside, 0.004),
-        "pressure_Pa": (inside, 0.004),
-        "wall_shear_stress_Pa": (along_wall, 0.002),
+        "velocity_m_s": (inside, 0.0015),
+        "pressure_Pa": (inside, 0.007),
+        "wall_shear_stress_Pa": (along_wall, 0.0025),
     }
     for name, (where, of_largest) in limits.items():
         found, wanted = (
@@ -165,7 +163,7 @@ def test_cycles_that_go_on_differing_are_told_from_those_that_become_alike() -> 
 
 
 def test_inflow_is_the_waveforms() -> None:
-    field = pulsing()
+    field = pulsing(0.25)
     time_s = np.array([phase.time_s for phase in field.phases])
     found = np.array([phase.inflow_mL_s for phase in field.phases])
     np.testing.assert_allclose(time_s, PULSE.period_s * np.arange(1, PHASES + 1) / PHASES)
@@ -190,7 +188,7 @@ def test_wall_shear_stress_has_womersleys_amplitude_and_phase(
 
 
 def test_time_averaged_stress_and_its_oscillation_are_those_of_the_phases() -> None:
-    field = pulsing()
+    field = pulsing(0.25)
     stress = np.array([phase.wall_shear_stress_Pa for phase in field.phases], float)
     np.testing.assert_allclose(field.shear_Pa, np.linalg.norm(stress, axis=2).mean(axis=0), rtol=1e-5)
     mean = np.linalg.norm(stress.mean(axis=0), axis=1)
@@ -237,6 +235,6 @@ def test_cycles_are_compared_phase_by_phase() -> None:
 
 def test_pulsatile_flow_without_swing_is_steady_flow() -> None:
     settings = FlowSettings(inflow_mL_s=0.4, numerics=Numerics(cell_size_mm=0.4, tolerance=0.001))
-    case = vessel_case(trace(Vessel(pulsing().wall)), settings)
+    case = vessel_case(trace(Vessel(pulsing(0.25).wall)), settings)
     steady, pulsed = simulate_case(case), simulate_case(replace(case, waveform=Waveform(0.5, (0.0,), (0.0,))))
     np.testing.assert_allclose(pulsed.velocity_m_s, steady.velocity_m_s, atol=0.01 * steady.speed_m_s.max())
