@@ -48,7 +48,7 @@ def round_diameter(width: float, thickness: float) -> float:
     It is twice the radius r of the circle onto which the plane outside the section is mapped conformally; slow flow far
     from the strut depends only on r. With the complete elliptic integrals K and E, width = 4 r (E(m) - (1 - m) K(m)),
     and thickness is the same expression with 1 - m. A square strut has the drag of a round wire 1.18 times as wide;
-    resolved rows of the two agree within 1 % (`tests/flow/lattice/test_crossing_cell.py`).
+    resolved rows of the two agree within 1 % (`tests/flow/lattice/test_periodic_box.py`).
     """
 
     def side(m: float) -> float:
