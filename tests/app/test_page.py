@@ -76,6 +76,13 @@ def artery(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def two_sacs(tmp_path_factory):
+    path = tmp_path_factory.mktemp("input") / "two.stl"
+    write_stl(path, app_case.two_sacs_surface())
+    return path
+
+
+@pytest.fixture(scope="module")
 def study(artery, tmp_path_factory):
     """The same at the command line."""
     out = tmp_path_factory.mktemp("study") / "study"
@@ -324,6 +331,49 @@ def test_the_section_has_the_phantoms_radius(client, case, workspace):
     assert section["device_diameter_mm"] < section["artery_diameter_mm"]
 
 
+def test_without_an_aneurysm_no_device_is_proposed_until_the_user_says_that_there_is_none(client, tmp_path):
+    write_stl(tmp_path / "healthy.stl", phantoms.phantom_surface(phantoms.siphon(), edge_mm=0.4))
+    case = f"/api/cases/{client.post('/api/cases', json={'name': 'healthy'}).json()['id']}"
+    client.put(f"{case}/input?name=healthy.stl", content=(tmp_path / "healthy.stl").read_bytes())
+    choose(client, case, units="mm")
+    client.post(f"{case}/input/done")
+    view = app_case.wait(client, case.rpartition("/")[2])
+    assert view["has_anatomy"]
+    assert view["failed"]["sac"].startswith("No aneurysm was found")  # by which the page knows it
+    assert [view["steps"][step] for step in STEPS[:5]] == ["done", "done", "failed", "todo", "todo"]
+    assert client.get(f"{case}/proposed").json()["sizes"] == {}
+    for route in ("sketch", "deployment"):
+        answer = client.post(f"{case}/{route}", json=wanted(SILK))
+        assert (answer.status_code, "No aneurysm was found" in answer.text) == (422, True)
+    for kind in ("rank", "flow"):
+        client.post(f"{case}/jobs/{kind}")
+        assert "No aneurysm was found" in str(app_case.wait(client, case.rpartition("/")[2])["failed"])
+    choose(client, case, without_aneurysm=True)
+    client.post(f"{case}/jobs/anatomy")
+    assert app_case.wait(client, case.rpartition("/")[2])["steps"]["sac"] == "done"
+    assert set(client.get(f"{case}/proposed").json()["sizes"]) == {"silk", "enterprise"}
+    assert client.post(f"{case}/deployment", json=wanted(SILK)).status_code == 200
+
+
+def test_of_several_sacs_each_has_its_place_and_its_numbers(client, two_sacs):
+    case = f"/api/cases/{client.post('/api/cases', json={'name': 'two'}).json()['id']}"
+    client.put(f"{case}/input?name=two.stl", content=two_sacs.read_bytes())
+    client.post(f"{case}/input/done")
+    app_case.wait(client, case.rpartition("/")[2])
+    first, second = app_case.opened(client.get(f"{case}/anatomy"))[0]["sacs"]
+    assert first["volume_mm3"] > 2 * second["volume_mm3"]
+    tables = client.get(f"{case}/numbers").json()["anatomy"]
+    assert [table["title"] for table in tables] == ["Sac 1", "Sac 2"]
+    for table, sac in zip(tables, (first, second), strict=True):
+        (volume,) = [row["cells"][0] for row in table["rows"] if row["key"] == "sac_volume_mm3"]
+        assert float(volume.split()[0]) == pytest.approx(sac["volume_mm3"], rel=0.01)
+    choose(client, case, at_mm=second["center_mm"])
+    client.post(f"{case}/jobs/anatomy")
+    app_case.wait(client, case.rpartition("/")[2])
+    (chosen,) = app_case.opened(client.get(f"{case}/anatomy"))[0]["sacs"]
+    assert chosen["center_mm"] == pytest.approx(second["center_mm"], abs=0.1)
+
+
 def test_every_size_is_ranked_and_a_click_chooses_one(client, case):
     choose(client, case, treatments=[alone("enterprise")])
     client.post(f"{case}/jobs/rank")
@@ -334,8 +384,7 @@ def test_every_size_is_ranked_and_a_click_chooses_one(client, case):
     assert [row["rank"] for row in found["rows"]] == list(range(1, 1 + len(find_design("enterprise").sizes)))
     first, *others = (row for row in found["rows"] if row["is_suitable"])
     assert [row["is_proposed"] for row in found["rows"]].count(True) == 1
-    assert first["is_proposed"]
-    scores = [row["score"] for row in others]
+    scores = [row["score"] for row in (first, *others)]
     assert scores == sorted(scores, reverse=True)
     assert all(row["reason"] for row in found["rows"])
     columns = {column["key"]: column for column in found["columns"]}

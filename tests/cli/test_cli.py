@@ -154,6 +154,19 @@ def test_without_a_sac_restore_says_so_and_leaves_none_of_another_case(
     assert "sac_volume_mm3" not in json.loads((out / "morphology.json").read_text())
 
 
+def test_without_a_sac_no_device_is_deployed_unless_it_is_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_stl(tmp_path / "healthy.stl", phantoms.phantom_surface(phantoms.siphon(), edge_mm=0.4))
+    given = [str(tmp_path / "healthy.stl"), "--units", "mm", "--device", "silk", "--out"]
+    for command in (["run", *given, str(tmp_path / "case"), "--no-flow"], ["rank", *given, str(tmp_path / "ranked")]):
+        assert main(command) == 2
+        assert _complaint(capsys, "No aneurysm was found, so no size or place of a device is proposed.")
+    assert not (tmp_path / "case").exists()
+    assert main(["run", *given, str(tmp_path / "placed"), "--no-flow", "--center", "20"]) == 0
+    assert main(["run", *given, str(tmp_path / "anyway"), "--no-flow", "--no-aneurysm"]) == 0
+
+
 def _complaint(capsys: pytest.CaptureFixture[str], said: str) -> bool:
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("vstent: ")]
     (line,) = [line for line in lines if "compiling its kernels" not in line]

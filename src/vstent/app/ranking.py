@@ -15,7 +15,7 @@ from vstent.study.folder import CACHE
 from vstent.study.keys import ANATOMY, anatomy_keys
 from vstent.study.progress import OnProgress, Progress
 from vstent.study.ranking_flows import FlowStore
-from vstent.study.stages import find_anatomy
+from vstent.study.stages import ask_for_aneurysm, find_anatomy
 from vstent.study.store import Key, Store
 
 MOST_PROCESSES: Final = 4
@@ -50,6 +50,7 @@ def rank_sizes(case: Case, progress: OnProgress) -> None:
     settings = case.state.settings()
     keys = anatomy_keys(case.state.source, settings)
     anatomy = find_anatomy(case.input, settings, Store(case.folder / CACHE, progress), keys)
+    ask_for_aneurysm(anatomy, settings)
 
     def told(n_done: int, n_all: int) -> None:
         progress(Progress("rank", min(n_done / n_all, 0.99), f"{n_done} of {n_all} sizes"))

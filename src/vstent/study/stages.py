@@ -24,7 +24,7 @@ from vstent.devices.design import Size
 from vstent.devices.ranges import how_sure
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.devices.treatment import BARE, Implant
-from vstent.errors import DeviceError, FlowError, InputError, LandingError, ReadError, VstentError
+from vstent.errors import DeviceError, FlowError, InputError, LandingError, ReadError, VesselError, VstentError
 from vstent.flow.background import BackgroundWork
 from vstent.flow.case import FlowField
 from vstent.flow.engines import Progress as FlowProgress
@@ -92,6 +92,16 @@ def find_anatomy(path: Path, settings: Settings, store: Store, keys: Keys) -> An
     return anatomy
 
 
+def ask_for_aneurysm(anatomy: Anatomy, settings: Settings) -> None:
+    """Raise VesselError where there is no aneurysm, and a device would get a proposed place nevertheless."""
+    placed = [implant.placing.position_mm for treatment in settings.treatments for implant in treatment.implants]
+    if not anatomy.aneurysms and not settings.anatomy.without_aneurysm and None in placed:
+        raise VesselError(
+            "No aneurysm was found, so no size or place of a device is proposed. Give a point in it (--at), or deploy "
+            " without one: at a position along the artery (--center), or in its middle (--no-aneurysm)."
+        )
+
+
 def other_reading(path: Path, settings: Settings) -> str:
     """Return a question that proposes another interpretation of the point `at_mm`; empty where none finds a vessel."""
     for words, point_mm in _readings(path, settings):
@@ -155,7 +165,9 @@ def deploy_all(
     """Return the implants of every treatment, stored or deployed, and the reasons why treatments do not fit, by name.
 
     DeviceError or LandingError is raised where no treatment can be deployed; the reason is that of the last one.
+    VesselError is raised where no aneurysm was found, and none is said to be missing.
     """
+    ask_for_aneurysm(anatomy, settings)
     deployed: dict[str, dict[str, Deployment]] = {}
     failures: dict[str, str] = {}
     for treatment in settings.treatments:
