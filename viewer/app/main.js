@@ -232,8 +232,8 @@ class Page {
     if (view.has_anatomy && this.anatomyKey !== view.anatomy) this.loadAnatomy();
     const read = JSON.stringify([view.choices.units, view.choices.frame]);
     if (view.has_input && !view.is_scan && !view.has_anatomy && this.inputKey !== read) this.loadInput(read);
-    const flow = view.has_flow ? `${view.steps.flow} ${view.anatomy} ${!view.job}` : undefined;
-    if (view.has_flow && !view.job && this.flowKey !== flow && ["flow", "report"].includes(this.step)) {
+    const flow = view.has_flow ? `${view.anatomy} ${view.results}` : undefined;
+    if (view.has_flow && this.flowKey !== flow && ["flow", "report"].includes(this.step)) {
       this.flowKey = flow;
       this.loadFlow();
     }
@@ -509,8 +509,8 @@ class Page {
     const parts = [];
     const flow = this.sheets?.flow?.[0];
     if (["flow", "report"].includes(this.step) && flow) {
-      const stale = this.view.steps.flow !== "done" ? [make("p", { className: "note stale" }, ["Settings have changed since this flow was computed: run the step Flow again."])] : [];
-      parts.push(head("Before and after"), ...stale, qualitySheet(flow), changeSheet(flow, this.isWhole, (name) => this.names.treatment(name)));
+      const stale = this.view.steps.flow === "stale" ? [make("p", { className: "note stale" }, ["Settings have changed since this flow was computed: run the step Flow again."])] : [];
+      parts.push(head("Before and after"), ...stale, changeSheet(flow, this.isWhole, (name) => this.names.treatment(name)), qualitySheet(flow));
     }
     if (this.isComparing) parts.push(head("Compared"), plainSheet(this.ranking.comparing.sheets(), this.isWhole));
     else if (["device", "deploy"].includes(this.step)) {

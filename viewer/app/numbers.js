@@ -40,7 +40,7 @@ export function changeSheet(sheet, isWhole, named) {
     rows.map((row) => {
       const columns = [cell("Before", "without a device", row.cells[0], "")];
       sheet.names.forEach((name, i) => columns.push(cell(named(name), sheet.devices[i], row.cells[1 + 2 * i], row.cells[2 + 2 * i], row.senses[i])));
-      return make("div", { className: "card" }, [term(row), make("div", { className: "card-cells" }, columns)]);
+      return make("div", { className: row.key.startsWith("neck_inflow_in_") ? "card beside" : "card" }, [term(row), make("div", { className: "card-cells" }, columns)]);
     }),
   );
 }

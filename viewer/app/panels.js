@@ -221,7 +221,7 @@ export const panels = {
       parts.push(make("p", { className: "hint" }, ["Deploys every device many times with varied threshold, landing and device diameter. The report then shows a 95 % interval for each result and its main causes."]));
       if (steps.report !== "done" && steps.flow === "done" && !job) parts.push(main("Write the report again", () => page.start("flow")));
     }
-    if (steps.flow !== "done") {
+    if (steps.flow !== "done" && job?.kind !== "angiogram") {
       parts.push(make("p", { className: "note" }, ["The report is written when the flow has been computed."]), next(page, "flow", "← Flow"));
     }
     parts.push(make("p", { className: "hint" }, [`The files are in ${page.view.folder}.`]));

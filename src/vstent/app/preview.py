@@ -20,7 +20,7 @@ from vstent.app.cases import Case
 from vstent.app.choices import Point
 from vstent.app.cuts import cut
 from vstent.app.films import films_message, kept_curves
-from vstent.app.finished import kept_flows, kept_histories
+from vstent.app.finished import kept_histories, shown_flows
 from vstent.app.scans import LOCK
 from vstent.deployment.contour import planes
 from vstent.deployment.deploy import propose_landing
@@ -386,7 +386,7 @@ class Preview:
         Raises ReadError: flows are missing.
         """
         with LOCK:
-            paths = kept_flows(self.case.folder)
+            paths = shown_flows(self.case.folder, self.case.state)
             if not paths:
                 raise ReadError("Some flows of these results are missing. Run the step Flow.")
             layers = [layer for name, path in paths.items() for layer in self._flow_layers(name, path, moment)]

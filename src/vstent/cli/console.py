@@ -174,7 +174,7 @@ def _add_flow_rows(table: Table, metrics: Mapping[str, Any], titles: Mapping[str
     graded = {one.name: one for one in qualities(metrics, {name: name for name in treatments})}
     if graded:
         table.add_row(
-            "Grade of the flow", *(graded[name].grade if name in graded else "" for name in (BARE, *treatments))
+            "Grid and convergence", *(graded[name].grade if name in graded else "" for name in (BARE, *treatments))
         )
         reasons = (one.sentence for one in graded.values() if one.reasons)
         table.caption = "\n".join([f"Flow: {graded[BARE].computation}.", *reasons])

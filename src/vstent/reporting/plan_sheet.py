@@ -9,7 +9,8 @@ import numpy as np
 from vstent.anatomy.landing_zones import ZONE_MM, neck_span_mm
 from vstent.devices.stent import Deployment, Stent
 from vstent.geometry.vessel import Anatomy
-from vstent.plan.rank import alternatives
+from vstent.plan.criteria import default_criteria
+from vstent.plan.rank import Candidate, alternatives, graded_anew, landing_measures
 from vstent.reporting.figures import Picture, Plate, wire_shots
 from vstent.reporting.paper import QUIET, Paper
 from vstent.reporting.quantities import format_value
@@ -56,7 +57,7 @@ def plan_pdf(case: Planned) -> bytes:
                 deployment=deployment,
                 metrics=case.metrics[name][key],
                 picture=_picture(case, name),
-                others=_alternative_rows(case, deployment.stent),
+                others=_size_rows(case, deployment.stent, case.metrics[name][key]),
             )
             for name, key, title, deployment in titled(case.implants)
         ]
@@ -100,8 +101,8 @@ def _write(
         paper.text(f"– {sentence}", 8)
     if len(warnings) > 1 + MOST_NOTES:
         paper.text(f"{len(warnings) - 1 - MOST_NOTES} more notes are in the report.", 8, color=QUIET)
-    paper.heading("Alternative sizes")
-    paper.table(others, (0.17, 0.13, 0.70), head=("Size", "Score of 100", "Reason"))
+    paper.heading("This size and alternatives")
+    paper.table(others, (0.20, 0.13, 0.67), head=("Size", "Score of 100", "Reason"))
     paper.text("Blood flow is not part of this plan. Name, date, signature: ______________________________", 8.5)
 
 
@@ -145,9 +146,10 @@ def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str,
     ]
 
 
-def _alternative_rows(case: Planned, stent: Stent) -> Sequence[tuple[str, str, str]]:
-    """Return the two best neighboring sizes of a device."""
-    found = alternatives(case.anatomy, stent.design, stent.size)
-    return [
-        (one.size.label, f"{100 * one.score:.0f}" if one.is_suitable else "unsuitable", one.reason) for one in found
-    ] or [("none fits", "", "")]
+def _size_rows(case: Planned, stent: Stent, metrics: Mapping[str, Any]) -> Sequence[tuple[str, str, str]]:
+    """Return the size of a device as it lies and its two best neighboring sizes, with their scores and reasons."""
+    measures = {**metrics, **landing_measures(case.anatomy, dict(metrics))}
+    own = graded_anew(Candidate(stent.design, stent.size, 0.0, measures, {}, 0.0, False, ""), default_criteria())
+    found = [(f"{own.size.label} (this)", own)]
+    found += [(one.size.label, one) for one in alternatives(case.anatomy, stent.design, stent.size)]
+    return [(title, f"{100 * one.score:.0f}" if one.is_suitable else "unsuitable", one.reason) for title, one in found]

@@ -92,10 +92,15 @@ def restore(
         candidates += others
     aneurysms = tuple(sorted(sacs, key=lambda sac: -sac.sac.volume_mm3))
     if at_mm is not None and not aneurysms:
-        raise InputError(
-            f"the bulge near {place(at_mm)} is too flat: no sac is left beyond its neck. Give a point in the dome of "
-            "another one, in LPS mm, or draw its neck (--neck)"
+        off_way = (
+            f"the artery to {vessel.far_ends[path].role} does not pass the bulge near {place(at_mm)}: leave out the "
+            "outlet (--outlet), or give another one"
         )
+        flat_bulge = (
+            f"the bulge near {place(at_mm)} is too flat: no sac is left beyond its neck. Give a point in the dome of "
+            "another one, in LPS mm, or draw its neck (--neck)."
+        )
+        raise InputError(flat_bulge if outlet_mm is None else off_way)
     flat = None if aneurysms or at_mm is not None else _flat_sac(vessel, outlet_mm, path, landing)
     parent = Path(PARENT, landing.axis, landing.section_radius_mm, landing.surface, landing.is_restored.ravel())
     notes = told(vessel, path, bulges or found, aneurysms, candidates, flat, is_drawn=drawn is not None)
