@@ -104,7 +104,7 @@ def _reach(anatomy: Anatomy, stent: Stent) -> str:
     short = f", {what} the {end} end of the neck"
     half_mm, center_mm = 0.5 * stent.deployed_length_mm, 0.5 * (proximal_mm + distal_mm)
     fits = half_mm < center_mm < anatomy.parent.axis.length_mm - half_mm
-    if fits and 0.5 * (before_mm + after_mm) >= wanted_mm:
+    if fits and 0.5 * (before_mm + after_mm) >= (wanted_mm if beyond_mm >= 0 else 0):  # what misses the neck is moved
         return f"{short} (move it {move})"
     same = [size for size in stent.design.sizes if size.diameter_mm == stent.size.diameter_mm]
     longer = [size for size in same if size.length_mm > stent.size.length_mm]
