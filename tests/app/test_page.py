@@ -474,9 +474,12 @@ def test_flows_of_the_best_sizes_join_a_ranking_that_is_there_before(artery, tmp
     """The flows are those of `rank_flows`, given the number that was chosen and a store in the case folder."""
     asked = {}
 
-    def flows(anatomy, found, settings, count, *, stored, progress):
+    def flows(anatomy, found, settings, count, *, stored, keep, progress):
         asked.update(count=count, store=type(stored), before=json.loads((folder / "ranking.json").read_text()))
         progress(0, 3, "no device")
+        field = FlowField.__new__(FlowField)
+        for one in (None, *found.candidates):
+            keep(one, field)
         best, *others = found.candidates
         best = replace(best, measures=best.measures | {"neck_inflow_change_fraction": -0.4})
         return replace(found, candidates=(best, *others))
@@ -487,10 +490,14 @@ def test_flows_of_the_best_sizes_join_a_ranking_that_is_there_before(artery, tmp
     choices = case.state.choices.model_copy(update={"treatments": (with_device("enterprise"),), "ranking_flows": 2})
     case.update(input="artery.stl", source=hash_of(folder / "artery.stl"), choices=choices)
     monkeypatch.setattr(ranking, "rank_flows", flows)
+    kept = []
+    monkeypatch.setattr(stored.Store, "save", lambda _, name, key, field: kept.append((name, key)))
     said = []
     ranking.rank_sizes(case, lambda now: said.append((now.stage, now.fraction, now.detail)))
     assert asked["count"] == 2
     assert asked["store"] is FlowStore
+    keys = study_keys(case.state.source, case.state.settings())  # the step Flow finds those that it would compute
+    assert kept == [(name, keys[name]) for name in ("flow bare", "flow enterprise")]
     after = json.loads((folder / "ranking.json").read_text())
     assert "neck_inflow_change_fraction" not in {column["key"] for column in asked["before"]["columns"]}
     assert "neck_inflow_change_fraction" in {column["key"] for column in after["columns"]}
