@@ -21,7 +21,7 @@ from vstent import phantoms
 from vstent.angiography.history import History
 from vstent.app import cuts, intake, ranking, sheets
 from vstent.app.cases import STEPS, Cases, load
-from vstent.app.finished import kept_flows
+from vstent.app.finished import kept_flows, shown_flows
 from vstent.app.workspace import Workspace
 from vstent.cli import main
 from vstent.deployment.deploy import deploy, propose_landing
@@ -645,6 +645,21 @@ def test_a_case_of_another_version_is_refused_in_a_sentence_and_left_as_it_is(tm
         Workspace(Cases(tmp_path / "cases")).open(tmp_path / "old")
     assert state.read_bytes() == before
     assert [path.name for path in state.parent.iterdir()] == ["app.json"]
+
+
+def test_each_flow_is_shown_as_it_ends(flown, tmp_path):
+    folder, _ = flown
+    case = Workspace(Cases(tmp_path / "cases"))
+    case.open(folder)
+    state = case.cases.get(case.opened).state
+    whole = kept_flows(folder)
+    assert list(shown_flows(folder, state)) == ["bare", "silk"]
+    whole["silk"].unlink()
+    assert shown_flows(folder, state) == {}  # of a finished study all flows are there
+    at_work = state.model_copy(update={"job": "flow"})
+    assert list(shown_flows(folder, at_work)) == ["bare"]
+    whole["bare"].unlink()
+    assert shown_flows(folder, at_work) == {}
 
 
 def test_flows_of_other_settings_are_not_taken_for_those_of_the_results(flown, tmp_path):
