@@ -297,6 +297,8 @@ def test_deployed_numbers_are_those_of_the_measures(client, case, workspace):
     row = next(row for row in told["measures"][0]["rows"] if row["key"] == "deployed_length_mm")
     assert float(row["cells"][0].split("\u202f")[0]) == pytest.approx(measures["deployed_length_mm"], rel=5e-3)
     assert row["meaning"]
+    (spanned,) = [row for row in told["measures"][0]["rows"] if row["key"] == "neck_covered_fraction"]
+    assert spanned["is_first"]
     sheet = client.post(f"{case}/bands", json=wanted(silk)).json()
     lengths = next(row for row in sheet["rows"] if row[0] == "Deployed length")
     low, value, high = (float(lengths[k].split("\u202f")[0]) for k in (2, 1, 3))

@@ -40,7 +40,10 @@ def shown_flows(folder: Path, state: State) -> dict[str, Path]:
     """Return the files of the flows to show by name: while they are computed, those that are finished."""
     if state.job != "flow":
         return kept_flows(folder)
-    paths = _flows_wanted(folder, _given(state))
+    try:
+        paths = _flows_wanted(folder, _given(state))
+    except InputError:  # a device that does not exist: the job says so
+        return {}
     return {name: path for name, path in paths.items() if path.is_file() and paths[BARE].is_file()}
 
 
