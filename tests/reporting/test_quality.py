@@ -8,6 +8,7 @@ from pages import Page
 
 from vstent.app import sheets
 from vstent.cli.console import comparison_table
+from vstent.reporting import definitions
 from vstent.reporting.page import as_html
 from vstent.reporting.quality import qualities, unusable
 from vstent.reporting.quantities import compare, format_change
@@ -88,6 +89,8 @@ def test_better_and_worse_only_where_a_direction_is_wanted() -> None:
     rows = {row.before.key: row for row in compare(report_case.metrics())}
     assert rows["neck_inflow_mL_s"].sense("silk") == "better"
     assert rows["turnover_time_s"].sense("silk") == "better"  # longer
+    beside = (definitions.WANTED.get(f"neck_inflow_in_{place}_mL_s") for place in ("sac", "artery"))
+    assert set(beside) == {None}  # they show how much the inflow depends on its position
     assert rows["mean_sac_wss_Pa"].sense("silk") == ""
     worse = report_case.metrics()
     worse["treatments"]["silk"]["flow"]["neck_inflow_mL_s"] = 0.5
