@@ -20,10 +20,10 @@ from vstent.anatomy.trim import trim
 from vstent.deployment.deploy import deploy
 from vstent.devices import catalogue
 from vstent.devices.stent import Deployment, Landing
-from vstent.errors import DeviceError, PluginError
+from vstent.errors import DeviceError, FlowError, PluginError
 from vstent.flow.problem import flow_case
 from vstent.flow.settings import FlowSettings, Numerics
-from vstent.flow.simulation import foretell_cost, simulate_case
+from vstent.flow.simulation import check_engine, foretell_cost, simulate_case
 from vstent.geometry.vessel import Anatomy, Vessel
 
 API = Path(__file__).parents[1] / "docs" / "reference" / "api.rst"
@@ -143,6 +143,11 @@ class Still(AbstractEngine):
     def trouble(self, state):
         return "none"
 
+
+class Half(AbstractEngine):
+    def init(self, case, start):
+        return case
+
 '''
 
 
@@ -155,7 +160,8 @@ def distribution(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: tiny-plugin\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(
         "[vstent.devices]\ntiny = tiny_plugin:devices\n\n"
-        "[vstent.engines]\nstill = tiny_plugin:Still\nmissing = tiny_plugin:Nothing\n"
+        "[vstent.engines]\nstill = tiny_plugin:Still\nhalf = tiny_plugin:Half\n"
+        "other = tiny_plugin:devices\nmissing = tiny_plugin:Nothing\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "tiny_plugin", raising=False)
@@ -191,11 +197,30 @@ def test_a_flow_engine_is_plugged_in(anatomy: Anatomy, tmp_path: Path) -> None:
 @pytest.mark.usefixtures("distribution")
 def test_plugins_that_are_not_there_are_named(anatomy: Anatomy) -> None:
     with pytest.raises(
-        PluginError, match=r"no 'stil' in vstent.engines: choose one of lattice_boltzmann, openfoam, missing, still"
+        PluginError,
+        match=r"no 'stil' in vstent.engines: choose one of lattice_boltzmann, openfoam, half, missing, other, still",
     ):
         simulate_case(flow_case(anatomy, (), FlowSettings(numerics=Numerics(engine="stil", cell_size_mm=3.0))))
     with pytest.raises(PluginError, match=r"missing of vstent.engines cannot be loaded"):
         simulate_case(flow_case(anatomy, (), FlowSettings(numerics=Numerics(engine="missing", cell_size_mm=3.0))))
+
+
+@pytest.mark.usefixtures("distribution")
+@pytest.mark.parametrize(
+    ("name", "said"), [("half", "lacks max_checks, result, resume, save"), ("other", "lacks AbstractEngine")]
+)
+def test_an_incomplete_engine_is_refused_before_anything_is_computed(name: str, said: str) -> None:
+    with pytest.raises(PluginError, match=f"The engine {name} is incomplete: it {said}"):
+        check_engine(FlowSettings(numerics=Numerics(engine=name)))
+
+
+def test_without_openfoam_its_engine_is_refused_before_anything_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vstent.flow.openfoam.program.find", lambda: pytest.fail("it was looked for"))
+    check_engine(FlowSettings(numerics=Numerics(engine="openfoam")), runs_here=False)
+    monkeypatch.undo()
+    monkeypatch.setattr("shutil.which", lambda *_, **__: None)
+    with pytest.raises(FlowError, match="OpenFOAM was not found"):
+        check_engine(FlowSettings(numerics=Numerics(engine="openfoam")))
 
 
 def test_two_threads_deploy_as_one_does(anatomy: Anatomy) -> None:

@@ -105,6 +105,52 @@ def test_of_a_treatment_with_two_implants_both_are_shown_and_each_is_moved(arter
         assert page.locator(".section .cut.device").count() == 2
 
 
+@pytest.mark.system
+def test_of_several_sacs_a_click_chooses_one(tmp_path):
+    write_stl(tmp_path / "two.stl", app_case.two_sacs_surface())
+    with app_case.served(tmp_path / "cases") as client, browsing(client) as page:
+        drop(page, tmp_path / "two.stl")
+        page.wait_for_selector(".step.done:nth-child(3)")
+        volume = page.locator(".sheet .row", has_text="Sac volume").first
+        playwright.expect(volume.locator("b")).to_have_count(2)
+        larger, smaller = volume.locator("b").all_inner_texts()
+        page.get_by_role("button", name="Sac 2").click()
+        page.get_by_role("button", name="Find the vessel again").click()
+        playwright.expect(volume.locator("b")).to_have_count(1)
+        assert number(volume.locator("b").inner_text()) == pytest.approx(number(smaller), rel=0.01)
+        assert number(larger) > 2 * number(smaller)
+        # A click on the sac itself chooses it as well.
+        page.get_by_role("button", name="Propose again").click()
+        page.get_by_role("button", name="Find the vessel again").click()
+        playwright.expect(page.get_by_role("button", name="Sac 1")).to_be_visible()
+        page.get_by_role("button", name="Whole").click()
+        still(page.get_by_role("button", name="Sac 2"))
+        box = page.get_by_role("button", name="Sac 2").bounding_box()
+        page.mouse.click(box["x"] - 8, box["y"] + box["height"] / 2)
+        at = chosen_when(client, "at_mm")
+        sacs = app_case.opened(client.get("/api/cases/two/anatomy"))[0]["sacs"]
+        apart = [np.linalg.norm(np.subtract(at, sac["center_mm"])) for sac in sacs]
+        assert apart[1] < 4 < apart[0]
+
+
+@pytest.mark.system
+def test_a_healthy_artery_gets_a_question_and_no_device(tmp_path):
+    write_stl(tmp_path / "healthy.stl", phantoms.phantom_surface(phantoms.siphon(), edge_mm=0.4))
+    with app_case.served(tmp_path / "cases") as client, browsing(client) as page:
+        drop(page, tmp_path / "healthy.stl")
+        page.wait_for_selector(".step.failed:nth-child(3)")
+        playwright.expect(page.locator(".question h3")).to_have_text("No aneurysm found")
+        for title in ("Device", "Deploy", "Flow"):
+            step(page, title)
+            playwright.expect(page.locator(".question h3")).to_be_visible()
+            playwright.expect(page.locator(".panel input, .panel select")).to_have_count(0)
+        page.get_by_role("button", name="Show where it is").click()
+        page.get_by_role("button", name="There is none").click()
+        page.wait_for_selector(".step.done:nth-child(3)")
+        step(page, "Deploy")
+        playwright.expect(page.locator(".handle.distal .handle-word")).to_contain_text("mm from inlet")
+
+
 RAMPS = """() => [...document.querySelectorAll('.viewer-bar')].map((bar) => {
     const box = (name) => bar.querySelector(name).getBoundingClientRect();
     const [ramp, ticks] = [box('.viewer-ramp'), box('.viewer-ticks')];
@@ -304,6 +350,17 @@ def still(knob):
     """Wait until it is there and lies still: the view glides from step to step."""
     knob.wait_for(state="visible")
     knob.element_handle().wait_for_element_state("stable")
+
+
+def number(words):
+    """The number at the begin of a text."""
+    return float(words.split()[0])
+
+
+def chosen_when(client, key):
+    """A choice, as soon as it is made."""
+    app_case.until(lambda: chosen(client)[key] is not None)
+    return chosen(client)[key]
 
 
 def drag(page, what, right, down):

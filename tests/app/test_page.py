@@ -21,7 +21,7 @@ from vstent import phantoms
 from vstent.angiography.history import History
 from vstent.app import cuts, intake, ranking, sheets
 from vstent.app.cases import STEPS, Cases, load
-from vstent.app.finished import kept_flows
+from vstent.app.finished import kept_flows, shown_flows
 from vstent.app.workspace import Workspace
 from vstent.cli import main
 from vstent.deployment.deploy import deploy, propose_landing
@@ -72,6 +72,13 @@ TWO = {
 def artery(tmp_path_factory):
     path = tmp_path_factory.mktemp("input") / "phantom.stl"
     write_stl(path, app_case.phantom_surface())
+    return path
+
+
+@pytest.fixture(scope="module")
+def two_sacs(tmp_path_factory):
+    path = tmp_path_factory.mktemp("input") / "two.stl"
+    write_stl(path, app_case.two_sacs_surface())
     return path
 
 
@@ -290,6 +297,8 @@ def test_deployed_numbers_are_those_of_the_measures(client, case, workspace):
     row = next(row for row in told["measures"][0]["rows"] if row["key"] == "deployed_length_mm")
     assert float(row["cells"][0].split("\u202f")[0]) == pytest.approx(measures["deployed_length_mm"], rel=5e-3)
     assert row["meaning"]
+    (spanned,) = [row for row in told["measures"][0]["rows"] if row["key"] == "neck_covered_fraction"]
+    assert spanned["is_first"]
     sheet = client.post(f"{case}/bands", json=wanted(silk)).json()
     lengths = next(row for row in sheet["rows"] if row[0] == "Deployed length")
     low, value, high = (float(lengths[k].split("\u202f")[0]) for k in (2, 1, 3))
@@ -324,6 +333,49 @@ def test_the_section_has_the_phantoms_radius(client, case, workspace):
     assert section["device_diameter_mm"] < section["artery_diameter_mm"]
 
 
+def test_without_an_aneurysm_no_device_is_proposed_until_the_user_says_that_there_is_none(client, tmp_path):
+    write_stl(tmp_path / "healthy.stl", phantoms.phantom_surface(phantoms.siphon(), edge_mm=0.4))
+    case = f"/api/cases/{client.post('/api/cases', json={'name': 'healthy'}).json()['id']}"
+    client.put(f"{case}/input?name=healthy.stl", content=(tmp_path / "healthy.stl").read_bytes())
+    choose(client, case, units="mm")
+    client.post(f"{case}/input/done")
+    view = app_case.wait(client, case.rpartition("/")[2])
+    assert view["has_anatomy"]
+    assert view["failed"]["sac"].startswith("No aneurysm was found")  # by which the page knows it
+    assert [view["steps"][step] for step in STEPS[:5]] == ["done", "done", "failed", "todo", "todo"]
+    assert client.get(f"{case}/proposed").json()["sizes"] == {}
+    for route in ("sketch", "deployment"):
+        answer = client.post(f"{case}/{route}", json=wanted(SILK))
+        assert (answer.status_code, "No aneurysm was found" in answer.text) == (422, True)
+    for kind in ("rank", "flow"):
+        client.post(f"{case}/jobs/{kind}")
+        assert "No aneurysm was found" in str(app_case.wait(client, case.rpartition("/")[2])["failed"])
+    choose(client, case, without_aneurysm=True)
+    client.post(f"{case}/jobs/anatomy")
+    assert app_case.wait(client, case.rpartition("/")[2])["steps"]["sac"] == "done"
+    assert set(client.get(f"{case}/proposed").json()["sizes"]) == {"silk", "enterprise"}
+    assert client.post(f"{case}/deployment", json=wanted(SILK)).status_code == 200
+
+
+def test_of_several_sacs_each_has_its_place_and_its_numbers(client, two_sacs):
+    case = f"/api/cases/{client.post('/api/cases', json={'name': 'two'}).json()['id']}"
+    client.put(f"{case}/input?name=two.stl", content=two_sacs.read_bytes())
+    client.post(f"{case}/input/done")
+    app_case.wait(client, case.rpartition("/")[2])
+    first, second = app_case.opened(client.get(f"{case}/anatomy"))[0]["sacs"]
+    assert first["volume_mm3"] > 2 * second["volume_mm3"]
+    tables = client.get(f"{case}/numbers").json()["anatomy"]
+    assert [table["title"] for table in tables] == ["Sac 1", "Sac 2"]
+    for table, sac in zip(tables, (first, second), strict=True):
+        (volume,) = [row["cells"][0] for row in table["rows"] if row["key"] == "sac_volume_mm3"]
+        assert float(volume.split()[0]) == pytest.approx(sac["volume_mm3"], rel=0.01)
+    choose(client, case, at_mm=second["center_mm"])
+    client.post(f"{case}/jobs/anatomy")
+    app_case.wait(client, case.rpartition("/")[2])
+    (chosen,) = app_case.opened(client.get(f"{case}/anatomy"))[0]["sacs"]
+    assert chosen["center_mm"] == pytest.approx(second["center_mm"], abs=0.1)
+
+
 def test_every_size_is_ranked_and_a_click_chooses_one(client, case):
     choose(client, case, treatments=[alone("enterprise")])
     client.post(f"{case}/jobs/rank")
@@ -334,8 +386,7 @@ def test_every_size_is_ranked_and_a_click_chooses_one(client, case):
     assert [row["rank"] for row in found["rows"]] == list(range(1, 1 + len(find_design("enterprise").sizes)))
     first, *others = (row for row in found["rows"] if row["is_suitable"])
     assert [row["is_proposed"] for row in found["rows"]].count(True) == 1
-    assert first["is_proposed"]
-    scores = [row["score"] for row in others]
+    scores = [row["score"] for row in (first, *others)]
     assert scores == sorted(scores, reverse=True)
     assert all(row["reason"] for row in found["rows"])
     columns = {column["key"]: column for column in found["columns"]}
@@ -425,9 +476,12 @@ def test_flows_of_the_best_sizes_join_a_ranking_that_is_there_before(artery, tmp
     """The flows are those of `rank_flows`, given the number that was chosen and a store in the case folder."""
     asked = {}
 
-    def flows(anatomy, found, settings, count, *, stored, progress):
+    def flows(anatomy, found, settings, count, *, stored, keep, progress):
         asked.update(count=count, store=type(stored), before=json.loads((folder / "ranking.json").read_text()))
         progress(0, 3, "no device")
+        field = FlowField.__new__(FlowField)
+        for one in (None, *found.candidates):
+            keep(one, field)
         best, *others = found.candidates
         best = replace(best, measures=best.measures | {"neck_inflow_change_fraction": -0.4})
         return replace(found, candidates=(best, *others))
@@ -438,10 +492,14 @@ def test_flows_of_the_best_sizes_join_a_ranking_that_is_there_before(artery, tmp
     choices = case.state.choices.model_copy(update={"treatments": (with_device("enterprise"),), "ranking_flows": 2})
     case.update(input="artery.stl", source=hash_of(folder / "artery.stl"), choices=choices)
     monkeypatch.setattr(ranking, "rank_flows", flows)
+    kept = []
+    monkeypatch.setattr(stored.Store, "save", lambda _, name, key, field: kept.append((name, key)))
     said = []
     ranking.rank_sizes(case, lambda now: said.append((now.stage, now.fraction, now.detail)))
     assert asked["count"] == 2
     assert asked["store"] is FlowStore
+    keys = study_keys(case.state.source, case.state.settings())  # the step Flow finds those that it would compute
+    assert kept == [(name, keys[name]) for name in ("flow bare", "flow enterprise")]
     after = json.loads((folder / "ranking.json").read_text())
     assert "neck_inflow_change_fraction" not in {column["key"] for column in asked["before"]["columns"]}
     assert "neck_inflow_change_fraction" in {column["key"] for column in after["columns"]}
@@ -589,6 +647,21 @@ def test_a_case_of_another_version_is_refused_in_a_sentence_and_left_as_it_is(tm
         Workspace(Cases(tmp_path / "cases")).open(tmp_path / "old")
     assert state.read_bytes() == before
     assert [path.name for path in state.parent.iterdir()] == ["app.json"]
+
+
+def test_each_flow_is_shown_as_it_ends(flown, tmp_path):
+    folder, _ = flown
+    case = Workspace(Cases(tmp_path / "cases"))
+    case.open(folder)
+    state = case.cases.get(case.opened).state
+    whole = kept_flows(folder)
+    assert list(shown_flows(folder, state)) == ["bare", "silk"]
+    whole["silk"].unlink()
+    assert shown_flows(folder, state) == {}  # of a finished study all flows are there
+    at_work = state.model_copy(update={"job": "flow"})
+    assert list(shown_flows(folder, at_work)) == ["bare"]
+    whole["bare"].unlink()
+    assert shown_flows(folder, at_work) == {}
 
 
 def test_flows_of_other_settings_are_not_taken_for_those_of_the_results(flown, tmp_path):

@@ -206,4 +206,4 @@ def charts_are_saved(page):
     assert {path.get("fill") for path in lines} == {"none"}
     root = alike(page, "section")
     assert not list(root.iter(f"{SVG}image"))
-    assert {"Position", "Artery"} < set(words(root))
+    assert {"From the neck", "Artery"} < set(words(root))

@@ -5,6 +5,9 @@ import io
 import json
 import subprocess
 import sys
+import zipfile
+from contextlib import nullcontext
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -154,6 +157,27 @@ def test_without_a_sac_restore_says_so_and_leaves_none_of_another_case(
     assert "sac_volume_mm3" not in json.loads((out / "morphology.json").read_text())
 
 
+def test_without_a_sac_no_device_is_deployed_unless_it_is_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_stl(tmp_path / "healthy.stl", phantoms.phantom_surface(phantoms.siphon(), edge_mm=0.4))
+    given = [str(tmp_path / "healthy.stl"), "--units", "mm", "--device", "silk", "--out"]
+    for command in (["run", *given, str(tmp_path / "case"), "--no-flow"], ["rank", *given, str(tmp_path / "ranked")]):
+        assert main(command) == 2
+        assert _complaint(capsys, "No aneurysm was found, so no size or place of a device is proposed.")
+    assert not (tmp_path / "case").exists()
+    assert main(["run", *given, str(tmp_path / "placed"), "--no-flow", "--center", "20"]) == 0
+    assert main(["run", *given, str(tmp_path / "anyway"), "--no-flow", "--no-aneurysm"]) == 0
+
+
+@pytest.mark.parametrize("name", ["scan.zip", "scan"])
+def test_an_archive_is_to_be_unpacked(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with zipfile.ZipFile(tmp_path / name, "w") as archive:
+        archive.writestr("Patient/SE1/slice-1.dcm", b"no slice")
+    assert main(["run", str(tmp_path / name), "--out", str(tmp_path / "out"), "--no-flow"]) == 2
+    assert _complaint(capsys, f"{name} is an archive. Unpack it, and give the folder or the file that it holds.")
+
+
 def _complaint(capsys: pytest.CaptureFixture[str], said: str) -> bool:
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("vstent: ")]
     (line,) = [line for line in lines if "compiling its kernels" not in line]
@@ -260,6 +284,18 @@ def test_inflows_of_arteries_are_taken() -> None:
     for speed_m_s in (0.009, 2.01):
         with pytest.raises(InputError, match=f"{speed_m_s:.2g} m/s"):
             check_inflow(anatomy, FlowSettings(inflow_mL_s=speed_m_s * area_mm2))
+
+
+def test_two_inlets_that_leave_one_narrow_outlet_are_refused() -> None:
+    anatomy = tubes.with_neck(tubes.tube(tubes.line(20.0), 2.0), 8.0, 12.0)
+    inlet, outlet = anatomy.vessel.openings
+    for area_mm2, is_refused in ((4.0, False), (3.0, True)):  # 0.27 m/s through two inlets of 12.6 mm2 are 6.8 mL/s
+        openings = inlet, replace(inlet, role="inlet_2"), replace(outlet, area_mm2=area_mm2)
+        vessel = replace(anatomy.vessel, openings=openings, centerlines=anatomy.vessel.centerlines * 2)
+        with (
+            pytest.raises(InputError, match="check whether each of them brings blood") if is_refused else nullcontext()
+        ):
+            check_inflow(replace(anatomy, vessel=vessel), FlowSettings())
 
 
 @pytest.mark.parametrize("option", ["--inlet", "--outlet"])

@@ -208,8 +208,9 @@ def test_the_command_writes_the_table_twice_and_a_report(scans, table, tmp_path,
     listed = tmp_path / "cohort.csv"
     listed.write_text(f"case,input,device,at\nfirst,{scans / 'a.stl'},leo,\nlast,{scans / 'c.stl'},,\n")
     command = ["batch", str(listed), "--out", str(out), "--no-flow", "--units", "mm", "--device", "enterprise"]
-    assert main([*command, "--jobs", "2", "--keep-files"]) == 0
+    assert main([*command, "--jobs", "2", "--keep-files"]) == 1  # the last case fails
     said = capsys.readouterr()
+    assert "1 of 2 rows are not done" in said.err
     assert "2 cases, 2 rows; 2 cases to do: about 1 min" in said.out
     with (out / "cohort.csv").open(newline="") as file:
         first, last = csv.DictReader(file)
@@ -224,7 +225,7 @@ def test_the_command_writes_the_table_twice_and_a_report(scans, table, tmp_path,
     page = (out / "cohort.html").read_text()
     assert last["sentence"] in page.replace("&#39;", "'")
     assert re.findall(r'alt="(.*?)"', page) == ["leo in the artery of first"]  # the other case has no device
-    assert main([*command, "--jobs", "2"]) == 0
+    assert main([*command, "--jobs", "2"]) == 1
     assert "0 cases to do" in capsys.readouterr().out
 
 

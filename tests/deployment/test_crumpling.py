@@ -142,7 +142,7 @@ def test_two_bends_in_opposite_directions_crumple_cells_and_the_advice_says_wher
     assert measures["min_cell_width_fraction"] < 0.2
     said = f" {count} of its 72 cells are crumpled, the narrowest to {measures['min_cell_width_fraction']:.0%} of the"
     assert said in done.advice
-    assert f"at {measures['narrowest_cell_abscissa_mm']:.1f} mm along the parent artery" in done.advice
+    assert f"{measures['narrowest_cell_abscissa_mm']:.1f} mm from the inlet" in done.advice
     assert done.advice.count("Choose a braided device.") == 1
     braid = deployed(PIPELINE, siphon())
     assert measure(siphon(), braid)["min_cell_width_fraction"] > 0.6
@@ -152,10 +152,10 @@ def test_two_bends_in_opposite_directions_crumple_cells_and_the_advice_says_wher
 @pytest.mark.parametrize(
     ("at_mm", "inward", "said"),
     [
-        (12.1, -1.0, "1.4 mm proximal to the proximal end of the neck, on the outer side of the bend"),
+        (12.1, -1.0, "1.4 mm proximal to the neck, on the outer side of the bend"),
         (14.0, 0.9, "0.5 mm distal to the proximal end of the neck, on the inner side of the bend"),
         (17.0, 0.1, "1.5 mm proximal to the distal end of the neck, between the inner and the outer side of the bend"),
-        (20.0, 0.0, "1.5 mm distal to the distal end of the neck"),
+        (20.0, 0.0, "1.5 mm distal to the neck"),
     ],
 )
 def test_the_place_is_told_from_the_nearer_end_of_the_neck(at_mm, inward, said):

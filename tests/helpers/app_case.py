@@ -5,6 +5,7 @@ import socket
 import threading
 import time
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 
 import httpx
@@ -44,6 +45,14 @@ def served(workspace, path=None):
 @cache
 def phantom_surface():
     return phantoms.phantom_surface(phantoms.demo_phantom(), edge_mm=0.5)
+
+
+@cache
+def two_sacs_surface():
+    """The demo with a smaller sac further downstream."""
+    demo = phantoms.demo_phantom()
+    second = phantoms.with_sac(demo, abscissa_mm=40.0, width_mm=5.0, neck_mm=3.5).sac
+    return phantoms.phantom_surface(replace(demo, blebs=(second,)), edge_mm=0.35)
 
 
 def wait(client, case, seconds=300):

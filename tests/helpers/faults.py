@@ -618,7 +618,7 @@ FAULTS: tuple[Fault, ...] = (
     ),
     Fault(SCAN, "NIfTI whose voxels begin elsewhere", nifti(108, struct.pack("<f", -100)), INPUT, "begin at byte -100"),
     Fault(SCAN, "NIfTI with a count below zero", nifti(42, struct.pack("<3h", -20, 20, 44)), INPUT, _DAMAGED),
-    Fault(SCAN, "NIfTI with voxels of no size", nifti(80, bytes(12)), INPUT, "give --spacing"),
+    Fault(SCAN, "NIfTI with two voxel sizes", nifti(80, struct.pack("<3f", 4, 4, 4)), INPUT, "give --spacing"),
     Fault(SCAN, "NIfTI with voxels of no kind", nifti(70, struct.pack("<2h", 999, 16)), INPUT, _DAMAGED),
     Fault(SCAN, "NIfTI with scaled voxels", nifti(112, struct.pack("<2f", 0.5, 10.0)), DONE, "Threshold"),
     Fault(SCAN, "NIfTI with axes sheared by 0.4 %", nifti(252, _sheared(0.004)), DONE, "not perpendicular"),

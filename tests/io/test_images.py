@@ -866,6 +866,7 @@ def header_with(tmp_path, upright, suffix, spacing):
         (".vti", ' Spacing="0.28"'),
         (".vti", ' Spacing="0.28 0.28 0"'),
         (".vti", ' Spacing="inf 0.28 0.28"'),
+        (".vti", ' Spacing="1_0 1_0 1_0"'),
         (".vtk", ""),
         (".vtk", "SPACINGS 0.2 0.2 0.4\n"),
         (".vtk", "SPACING 0,2 0,2 0,4\n"),
@@ -875,6 +876,7 @@ def header_with(tmp_path, upright, suffix, spacing):
         (".mha", "ElementSpacings = 0.2 0.2 0.4\n"),
         (".mha", "written by a script\nElementSpacing = 0.2 0.2 0.4\n"),
         (".mha", "ElementSpacing = nan 0.2 0.4\n"),
+        (".mha", "ElementSpacing = 0.2 0.2 0.4\nElementSpacing = 1 1 1\n"),
         (".mha", "ElementSpacing = 0,2 0,2 0,4\n"),
         (".nrrd", "space directions: (0.2,0,0) (0,0.2,0) none\n"),
         (".nrrd", "space directions: none (0,0.2,0) (0,0,0.4)\n"),
@@ -887,7 +889,7 @@ def test_a_spacing_that_is_not_known_is_an_error(upright, tmp_path, suffix, spac
     file = header_with(tmp_path, upright, suffix, spacing)
     with pytest.raises(InputError) as caught:
         read_image(file)
-    assert re.search("does not state a voxel spacing|is damaged|which readers skip", str(caught.value))
+    assert re.search("does not state a voxel spacing|is damaged|which readers skip|twice", str(caught.value))
 
 
 @pytest.mark.parametrize("key", ["Offset", "TransformMatrix"])
@@ -1048,6 +1050,31 @@ def test_nifti_without_pixel_sizes_is_refused(oblique, tmp_path):
     data = bytearray(file.read_bytes())
     data[80:92] = bytes(12)
     file.write_bytes(bytes(data))
+    np.testing.assert_allclose(read_image(file).affine_mm, oblique.affine_mm, atol=1e-5)  # of its sform
+    data[254:256] = bytes(2)  # which it no longer has
+    file.write_bytes(bytes(data))
+    with pytest.raises(UnitError, match="does not state a voxel spacing"):
+        read_image(file)
+
+
+def test_nifti_with_two_spacings_is_refused(oblique, tmp_path):
+    file = tmp_path / "scan.nii"
+    SimpleITK.WriteImage(itk_scan(oblique), str(file))
+    data = bytearray(file.read_bytes())
+    for edge, is_refused in ((1.0, False), (3.0, True)):  # 1 mm is what a header holds before it is set
+        data[80:92] = np.full(3, edge, dtype="<f4").tobytes()
+        file.write_bytes(bytes(data))
+        if is_refused:
+            with pytest.raises(UnitError, match=r"states two voxel spacings, 3 x 3 x 3 \(pixdim\) and .* \(sform\)"):
+                read_image(file)
+        else:
+            np.testing.assert_allclose(read_image(file).affine_mm, oblique.affine_mm, atol=1e-5)
+
+
+def test_a_spacing_in_a_comment_is_not_known(upright, tmp_path):
+    file = header_with(tmp_path, upright, ".vti", "")
+    text = file.read_bytes().replace(b"<ImageData", b'<!-- <ImageData Spacing="0.2 0.2 0.4"> --><ImageData', 1)
+    file.write_bytes(text)
     with pytest.raises(UnitError, match="does not state a voxel spacing"):
         read_image(file)
 

@@ -62,8 +62,7 @@ def test_every_size_at_every_shift_is_tried_once_and_sorted_by_the_stated_rule()
     wanted = [task for task in wanted if task[0] != "silk" or task[1] in SILK.sizes[4::11]]
     assert sorted(tried, key=str) == sorted(wanted, key=str)
     for one in found:
-        stands = one.is_suitable, one.is_proposed, one.score
-        better = [c for c in found if (c.is_suitable, c.is_proposed, c.score) > stands]
+        better = [c for c in found if (c.is_suitable, c.score) > (one.is_suitable, one.score)]
         assert len(better) <= found.index(one)
     proposed = [c for c in found if c.is_proposed]
     designs = (replace(SILK, sizes=SILK.sizes[4::11]), ENTERPRISE)
@@ -113,6 +112,16 @@ def test_too_narrow_too_long_and_off_the_neck_are_ruled_out_and_the_proposed_siz
     assert shifted.measures["landing_length_mm"] < 0
     assert "beyond the neck" in shifted.reason
     assert shifted.reason.startswith("Ruled out")
+
+
+def test_too_long_too_wide_and_short_of_the_neck_rank_well_below_the_proposed_size():
+    proposed = propose_size(SILK, artery())
+    long = catalogue.find_size(SILK, diameter_mm=proposed.diameter_mm, length_mm=30)
+    wide = catalogue.find_size(SILK, diameter_mm=proposed.diameter_mm + 1.5, length_mm=proposed.length_mm)
+    first, *rest = rank(artery(), [replace(SILK, sizes=(long, wide, proposed))], shifts_mm=[0.0, 8.0]).candidates
+    assert (first.size, first.is_proposed) == (proposed, True)
+    assert {c.size for c in rest if c.is_suitable and c.shift_mm == 0} <= {long, wide}
+    assert all(c.score < first.score - 0.03 for c in rest)
 
 
 def test_a_bend_ratio_is_the_diameter_over_the_radius_of_an_arc():

@@ -90,7 +90,7 @@ def banded(case: Planned) -> dict[str, dict[str, dict]]:
 def test_it_states_what_was_measured(planned) -> None:
     case, _, text = planned
     for deployment, metrics in all_of(case):
-        assert f"{deployment.stent.deployed_length_mm:.1f} mm (" in text
+        assert f"{deployment.stent.deployed_length_mm:.1f} mm" in text
         assert f"{100 * metrics['neck_metal_coverage_fraction']:.1f} %" in text
     assert "2026-11-26" in text
     assert "9f9f9f9f9f9f9f9f…" in text

@@ -8,6 +8,7 @@ from pages import Page
 
 from vstent.app import sheets
 from vstent.cli.console import comparison_table
+from vstent.reporting import definitions
 from vstent.reporting.page import as_html
 from vstent.reporting.quality import qualities, unusable
 from vstent.reporting.quantities import compare, format_change
@@ -61,13 +62,13 @@ def test_no_change_is_shown_of_a_flow_that_is_not_usable(grades: dict[str, str],
         assert plain == expected, place
 
 
-def test_grade_and_grid_stand_before_the_first_number_of_the_report() -> None:
+def test_grade_and_grid_stand_below_the_first_numbers_of_the_report_and_say_what_is_graded() -> None:
     metrics = graded(bare="good", silk="fair", enterprise="not usable")
     told = replace(report_case.contents(), metrics=metrics, changes=compare(metrics, unusable(metrics)))
     text = Page(as_html(told)).text.replace("\u202f", " ")
-    before = text.partition("Neck inflow")[0]
-    assert "✓ Without a device: good" in before
-    assert "~ Silk" in before
+    before = text.partition("Change is after")[0]
+    assert before.index("Neck inflow") < before.index("✓ Grid and convergence without a device: good")
+    assert "~ Grid and convergence with Silk" in before
     assert "fair (9 cells across the neck)" in before
     assert "not usable (9 cells across the neck)" in before
     assert "grid spacing 0.400 mm, 19,152 cells, 4,000 time steps, inflow 3.74 mL/s (Reynolds number 297)" in before
@@ -88,6 +89,8 @@ def test_better_and_worse_only_where_a_direction_is_wanted() -> None:
     rows = {row.before.key: row for row in compare(report_case.metrics())}
     assert rows["neck_inflow_mL_s"].sense("silk") == "better"
     assert rows["turnover_time_s"].sense("silk") == "better"  # longer
+    beside = (definitions.WANTED.get(f"neck_inflow_in_{place}_mL_s") for place in ("sac", "artery"))
+    assert set(beside) == {None}  # they show how much the inflow depends on its position
     assert rows["mean_sac_wss_Pa"].sense("silk") == ""
     worse = report_case.metrics()
     worse["treatments"]["silk"]["flow"]["neck_inflow_mL_s"] = 0.5

@@ -12,7 +12,7 @@ import pytest
 from vstent import phantoms
 from vstent.devices.catalogue import find_design
 from vstent.devices.treatment import Implant, Placing, Treatment, with_device
-from vstent.errors import FlowError, InputError, LandingError
+from vstent.errors import FlowError, FolderError, InputError, LandingError
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.settings import FlowSettings, Numerics
 from vstent.geometry.surface import Surface
@@ -26,6 +26,7 @@ from vstent.study.folder import CACHE, INPUT
 from vstent.study.keys import implant_keys, study_keys
 from vstent.study.outputs import write_ranking
 from vstent.study.pipeline import refine_flow, restore_vessel, run, trace_vessel
+from vstent.study.progress import Progress
 from vstent.study.settings import AnatomySettings, InputSettings, Settings
 from vstent.study.store import Key, Store
 
@@ -353,3 +354,14 @@ def test_a_point_in_another_frame_is_recognized(arteries: tuple[Path, Path], tmp
     x, y, z = anatomy.aneurysms[0].sac.vertices_mm.mean(axis=0).tolist()
     with pytest.raises(InputError, match=rf"Did you mean {x:.1f},{y:.1f},{z:.1f} \(the point given is RAS\)\?"):
         restore_vessel(moved, tmp_path / "other", replace(PLAIN, anatomy=AnatomySettings((-x, -y, z))), quiet)
+
+
+def test_a_folder_removed_during_a_run_is_reported(arteries: tuple[Path, Path], tmp_path: Path) -> None:
+    out = tmp_path / "out"
+
+    def remove(now: Progress) -> None:
+        if now.stage == "measure" and now.fraction == 0.0:
+            shutil.rmtree(out, ignore_errors=True)
+
+    with pytest.raises(FolderError, match="was removed while this run wrote to it, and is not complete: run it again"):
+        run(arteries[0], out, PLAIN, remove)

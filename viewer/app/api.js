@@ -10,6 +10,14 @@ export class Refusal extends Error {
   }
 }
 
+const FIELDS = { cell_size_mm: "Grid spacing", inflow_mL_s: "Mean inflow", upstream_mm: "Before sac", downstream_mm: "Beyond sac", spacing_mm: "Voxel spacing", shape: "Voxels" };
+
+/** What is wrong with a field, and its name. */
+function said({ loc, msg }) {
+  const name = loc.filter((part) => typeof part === "string").at(-1);
+  return `${FIELDS[name] ?? name.replaceAll("_", " ")}: ${msg.replace(/^Value error, /, "")}`;
+}
+
 async function ask(method, path, body) {
   const options = { method, headers: {} };
   if (body instanceof Blob) options.body = body;
@@ -29,7 +37,7 @@ async function ask(method, path, body) {
   let sentence = text;
   try {
     const { detail } = JSON.parse(text);
-    sentence = typeof detail === "string" ? detail : detail.map(({ msg }) => msg).join("; ");
+    sentence = typeof detail === "string" ? detail : detail.map(said).join("; ");
   } catch {
     // not JSON: the text is the sentence
   }

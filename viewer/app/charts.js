@@ -59,9 +59,14 @@ export class AlongChart {
     this.x = x;
     const y = (mm) => height - bottom - ((height - top - bottom) * mm) / most;
     const parts = ticks(0, most, 3).flatMap((v) => level(y(v), left, width - right, String(v)));
-    for (const v of ticks(0, length, Math.max(4, width / 110))) parts.push(text(x(v), height - 9, String(v), { class: "tick middle" }));
+    const [first, last] = neck?.length ? neck : [0, 0]; // distances count from both ends of the neck, else from the inlet
+    const tick = (mm, v) => parts.push(text(x(mm), height - 9, String(v), { class: "tick middle" }));
+    for (const v of ticks(0, Math.max(first, length - last), Math.max(4, width / 90))) {
+      if (v <= first && (v || !neck?.length)) tick(first - v, v);
+      if (v && last + v <= length) tick(last + v, v);
+    }
     parts.push(text(4, 13, "Diameter, mm", { class: "axis-title" }));
-    parts.push(text(width - right, 13, width > 480 ? "along the parent artery, mm from the inlet" : "at mm from the inlet", { class: "axis-title end" }));
+    parts.push(text(width - right, 13, `${width > 480 ? "along the parent artery, " : ""}mm from the ${neck?.length ? "neck" : "inlet"}`, { class: "axis-title end" }));
     if (neck?.length) parts.push(svg("rect", { x: x(neck[0]), width: x(neck[1]) - x(neck[0]), y: top, height: height - top - bottom, class: "neck-zone" }));
     parts.push(svg("path", { d: path(axis.abscissa.map((s, i) => [x(s), y(axis.diameter[i])])), class: "line artery" }));
     if (device) parts.push(...this.device(device, x, y, height - bottom));
@@ -81,6 +86,12 @@ export class AlongChart {
       ...bands.map(([low, high]) => svg("rect", { x: x(low), width: Math.max(x(high) - x(low), 2), y: floor - 5, height: 5, class: "band" })),
     ];
   }
+}
+
+/** Where a place on the parent axis is, from the nearer end of the neck. */
+function besideNeck(mm, [first, last]) {
+  if (mm < first) return `${(first - mm).toFixed(1)} mm proximal`;
+  return mm > last ? `${(mm - last).toFixed(1)} mm distal` : "within it";
 }
 
 /** What a plane across the artery cuts, to scale, with its diameters. */
@@ -116,7 +127,7 @@ export class SectionChart {
 
   say(section) {
     const rows = [
-      ["Position", `${section.abscissa_mm.toFixed(1)} mm`],
+      this.neck?.length ? ["From the neck", besideNeck(section.abscissa_mm, this.neck)] : ["From the inlet", `${section.abscissa_mm.toFixed(1)} mm`],
       ["Artery", `⌀ ${section.artery_diameter_mm.toFixed(2)} mm`],
     ];
     if ("device_diameter_mm" in section) {

@@ -2,6 +2,7 @@
 import { make } from "../src/dom.js";
 import { get, Newest, post, postBinary } from "./api.js";
 import { label, makeHandle } from "./handles.js";
+import { reachOf, reachWords } from "./numbers.js";
 
 const STEP_MM = 0.2;
 const REST_MS = 400; // the bands are asked for when the device has lain still for so long, so that a drag never waits for them
@@ -101,7 +102,9 @@ export class Deploying {
     this.place = answer.manifest;
     this.page.picture.put(answer);
     this.handles.forEach(({ element }, i) => {
-      label(element, `${this.place.ends_mm[i].toFixed(1)} mm`);
+      const [mm, neck] = [this.place.ends_mm[i], this.page.anatomy.neck];
+      label(element, reachWords(i, mm, neck));
+      element.classList.toggle("bad", reachOf(i, mm, neck) < 0);
     });
     const { profile, ends_mm, ends_band_mm } = this.place;
     this.page.along.set({ device: { profile, ends: ends_mm, bands: ends_band_mm } });
@@ -110,7 +113,7 @@ export class Deploying {
 
   /** Put the section at an abscissa. */
   look(mm) {
-    if (mm === null || !this.axis) return;
+    if (!Number.isFinite(mm) || !this.axis) return;
     this.cursor = mm;
     this.page.along.set({ cursor: mm });
     this.page.picture.stage?.redraw();

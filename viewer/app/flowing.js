@@ -4,7 +4,8 @@ import { drop, getBinary, post } from "./api.js";
 import { chartButton } from "./exporting.js";
 
 const EVERY_MS = 220;
-const NAMES = { neck_inflow_mL_s: ["Neck inflow", "mL/s", 1], sac_velocity_m_s: ["Mean sac velocity", "mm/s", 1000] };
+const NAMES = { neck_inflow_mL_s: "Neck inflow", sac_velocity_m_s: "Mean sac velocity" };
+const signed = (v) => `${v > 0 ? "+" : "−"}${Math.abs(v).toFixed(0)}`;
 
 export class Flowing {
   constructor(page) {
@@ -103,14 +104,14 @@ export class Flowing {
     const { fraction, is_stale, is_settled, values, reductions, history, error_points } = manifest;
     this.element.classList.toggle("stale", is_stale);
     if (!("neck_inflow_mL_s" in reductions)) return this.say(fraction < 1 ? `Computing the flow in the artery: ${Math.round(100 * fraction)} %` : "The flow develops: first numbers follow.");
-    const moving = is_stale ? "The device has moved: new values follow." : is_settled ? "Steady." : "The flow is adapting to the device and is averaged: the uncertainty (±) decreases with time.";
-    this.say(`${moving} Grid spacing ${values.grid_spacing_mm.toFixed(2)} mm; ± includes the usual difference from the full computation.`);
+    const moving = is_stale ? "The device has moved: new values follow." : is_settled ? "Steady." : "The flow is adapting to the device and is averaged: the bands shrink with time.";
+    this.say(`${moving} Grid spacing ${values.grid_spacing_mm.toFixed(2)} mm; bands include the usual difference from the full computation.`);
     this.cards.replaceChildren(
-      ...Object.entries(NAMES).map(([key, [name, unit, factor]]) =>
+      ...Object.entries(NAMES).map(([key, name]) =>
         make("div", { className: "card" }, [
-          make("span", { className: "term" }, [name]),
-          make("b", {}, [`${reductions[key] > 0 ? "+" : "−"}${Math.abs(reductions[key]).toFixed(0)}${key in error_points ? ` ± ${Math.ceil(error_points[key])}` : ""} %`]),
-          make("small", {}, [`${(factor * values[`now_${key}`]).toPrecision(3)} ${unit}, without a device ${(factor * values[`bare_${key}`]).toPrecision(3)}`]),
+          make("span", { className: "term" }, [`${name}, change`]),
+          make("b", { className: key in error_points ? "" : "pending" }, [signed(reductions[key]), " %"]),
+          make("small", {}, [key in error_points ? `${signed(Math.max(reductions[key] - error_points[key], -100))} to ${signed(reductions[key] + error_points[key])} %` : "not averaged yet"]),
         ]),
       ),
     );

@@ -1,18 +1,13 @@
 // Words on the scene, so that colour alone carries nothing.
-import { Vector3 } from "three";
 import { make } from "../src/dom.js";
 
-/** The word "Sac" beside the sac while it is drawn. */
-export class SacLabel {
-  constructor(picture) {
-    this.picture = picture;
-    this.mark = { element: make("span", { className: "opening scene-label" }, [make("b", {}, ["Sac"])]), isLabel: true, point: () => this.point() };
-  }
-
-  point() {
-    const layer = this.picture.shown.has("sac") && this.picture.stage?.layers.find(({ id }) => id === "sac");
-    if (!layer) return null;
-    if (!layer.geometry.boundingBox) layer.geometry.computeBoundingBox();
-    return layer.geometry.boundingBox.getCenter(new Vector3()).toArray();
-  }
+/** Names of the sacs beside them while they are drawn; of several sacs a click on a name chooses that one. */
+export function sacMarks({ sacs }, picture, choose) {
+  return sacs.map(({ center_mm, volume_mm3 }, i) => {
+    const one = () => make("span", { className: "opening scene-label" }, [make("b", {}, ["Sac"])]);
+    const words = [make("b", {}, [`Sac ${i + 1}`]), make("span", {}, [`${volume_mm3.toFixed(0)} mm³`])];
+    const title = i ? "Click to choose this sac" : "Devices and flow refer to this sac";
+    const several = () => make("button", { type: "button", className: "opening sac", title, disabled: !i, onClick: () => choose(center_mm) }, words);
+    return { element: sacs.length > 1 ? several() : one(), isLabel: true, point: () => picture.shown.has("sac") && center_mm };
+  });
 }

@@ -9,7 +9,7 @@ import { chartButton } from "./exporting.js";
 import { Films } from "./films.js";
 import { Flowing } from "./flowing.js";
 import { Imaging } from "./imaging.js";
-import { SacLabel } from "./labels.js";
+import { sacMarks } from "./labels.js";
 import { Neck } from "./neck.js";
 import { bandWords, changeSheet, neckWords, placeWords, plainSheet, qualitySheet, sureSheet } from "./numbers.js";
 import { panels, placeOf, spokenRole } from "./panels.js";
@@ -140,7 +140,6 @@ class Page {
     this.frame?.remove();
     this.picture = new Picture(this);
     this.ranking = new Ranking(this);
-    this.sacLabel = new SacLabel(this.picture);
     this.along = new AlongChart();
     this.section = new SectionChart();
     this.flowing = new Flowing(this);
@@ -213,7 +212,7 @@ class Page {
   finished(before) {
     this.isFollowing = false;
     const step = { anatomy: "sac", flow: "flow" }[before.job.kind];
-    if (this.view.steps[step] === "done") this.goForward(step);
+    if (["done", "failed"].includes(this.view.steps[step])) this.goForward(step);
   }
 
   /** Turn to a step that lies ahead. */
@@ -233,8 +232,8 @@ class Page {
     if (view.has_anatomy && this.anatomyKey !== view.anatomy) this.loadAnatomy();
     const read = JSON.stringify([view.choices.units, view.choices.frame]);
     if (view.has_input && !view.is_scan && !view.has_anatomy && this.inputKey !== read) this.loadInput(read);
-    const flow = view.has_flow ? `${view.steps.flow} ${view.anatomy} ${!view.job}` : undefined;
-    if (view.has_flow && !view.job && this.flowKey !== flow && ["flow", "report"].includes(this.step)) {
+    const flow = view.has_flow ? `${view.anatomy} ${view.results}` : undefined;
+    if (view.has_flow && this.flowKey !== flow && ["flow", "report"].includes(this.step)) {
       this.flowKey = flow;
       this.loadFlow();
     }
@@ -272,6 +271,7 @@ class Page {
       this.deploying.setAxis(this.axis);
       this.trimming.set(this.axis, answer.manifest.neck);
       this.along.set({ axis: answer.manifest.axis, neck: answer.manifest.neck });
+      this.section.neck = answer.manifest.neck;
       this.lookAtNeck();
       this.imaging.follow(this.view);
       this.measures = {};
@@ -391,10 +391,19 @@ class Page {
       this.neck.set(this.view.choices.neck_mm ?? curve_mm, handles);
       const choose = (opening) => opening.role !== "inlet" && this.choose({ outlet_mm: placeOf(opening) });
       const outlets = this.openingMarks(choose, "Click to let the parent artery lead here", "opening name");
-      return [...this.neck.handles, ...outlets, this.sacLabel.mark];
+      return [...this.neck.handles, ...outlets, ...this.sacMarks()];
     }
-    if (this.step === "device" && !this.isComparing) return [this.sacLabel.mark];
-    return this.step === "deploy" && this.treatment ? [...this.deploying.handles, this.deploying.cursorMark] : [];
+    if (this.step === "device" && !this.isComparing) return this.sacMarks();
+    return this.step === "deploy" && this.treatment && !this.asksForAneurysm ? [...this.deploying.handles, this.deploying.cursorMark] : [];
+  }
+
+  /** Whether no aneurysm was found, and the user has not said where it is or that there is none. */
+  get asksForAneurysm() {
+    return Boolean(this.anatomy && this.view.failed.sac?.startsWith("No aneurysm was found"));
+  }
+
+  sacMarks() {
+    return sacMarks(this.anatomy, this.picture, (center) => this.setSeed(center));
   }
 
   get isComparing() {
@@ -441,7 +450,7 @@ class Page {
 
   renderDeploy() {
     const { treatment, implant } = this;
-    if (!treatment) return;
+    if (!treatment || this.asksForAneurysm) return;
     this.picture.moved = (event) => this.deploying.look(this.axis.under(event, null));
     const key = JSON.stringify([treatment, implant.id, this.colour, this.view.anatomy]);
     if (this.shownTreatment !== key || !this.measures[treatment.name]) {
@@ -500,8 +509,8 @@ class Page {
     const parts = [];
     const flow = this.sheets?.flow?.[0];
     if (["flow", "report"].includes(this.step) && flow) {
-      const stale = this.view.steps.flow !== "done" ? [make("p", { className: "note stale" }, ["Settings have changed since this flow was computed: run the step Flow again."])] : [];
-      parts.push(head("Before and after"), ...stale, qualitySheet(flow), changeSheet(flow, this.isWhole, (name) => this.names.treatment(name)));
+      const stale = this.view.steps.flow === "stale" ? [make("p", { className: "note stale" }, ["Settings have changed since this flow was computed: run the step Flow again."])] : [];
+      parts.push(head("Before and after"), ...stale, changeSheet(flow, this.isWhole, (name) => this.names.treatment(name)), qualitySheet(flow));
     }
     if (this.isComparing) parts.push(head("Compared"), plainSheet(this.ranking.comparing.sheets(), this.isWhole));
     else if (["device", "deploy"].includes(this.step)) {
@@ -518,7 +527,10 @@ class Page {
   toldTreatment(manifest, isWhole) {
     this.place = manifest;
     if (isWhole) {
-      this.measures[manifest.treatment] = manifest.measures;
+      const [low, high] = manifest.length_band_mm.map((mm) => mm.toFixed(1));
+      const meaning = "Range for an uncertainty of the artery's diameters alone; the band beside the deployed length includes the device's numbers.";
+      const range = { key: "length_range", name: "Deployed length, for the artery's diameters", meaning, source: "", cells: [`${low} to ${high}\u202fmm`], is_first: false };
+      this.measures[manifest.treatment] = manifest.measures.map((sheet) => ({ ...sheet, rows: sheet.title === manifest.title || manifest.measures.length === 1 ? [...sheet.rows, range] : sheet.rows }));
       this.advice = manifest.advice;
       this.renderNumbers();
       this.portrait.take(`${manifest.treatment} ${JSON.stringify(manifest.ends_mm)}`);
@@ -526,7 +538,7 @@ class Page {
       if (this.deploying.cursor === undefined && this.anatomy.neck.length) this.deploying.look((this.anatomy.neck[0] + this.anatomy.neck[1]) / 2);
       else this.deploying.look(this.deploying.cursor);
     }
-    this.panel.querySelector(".place")?.replaceChildren(...placeWords(manifest));
+    this.panel.querySelector(".place")?.replaceChildren(...placeWords(manifest, this.bands, this.anatomy.neck));
   }
 
   /** The bands of the device that lies still; null while it is dragged. */
@@ -534,6 +546,8 @@ class Page {
     this.bands = sheet;
     const bands = this.panel.querySelector(".bands");
     if (bands) redraw(bands, ...bandWords(sheet));
+    const { place } = this;
+    if (sheet && place?.treatment === sheet.treatment && place.implant === sheet.implant) this.panel.querySelector(".place")?.replaceChildren(...placeWords(place, sheet, this.anatomy.neck));
   }
 
   /** A stage of a job in words: ``flow silk``, ``deploy silk+silk_2 silk_2``. */

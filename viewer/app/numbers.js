@@ -6,13 +6,16 @@ function term({ name, meaning, source }) {
   return make("span", { className: title ? "term defined" : "term", title, tabIndex: title ? 0 : -1 }, [name]);
 }
 
+/** Whether a value says that a device does not span the neck. */
+const isMissed = ({ key }, value) => key === "neck_covered_fraction" && !value.startsWith("100");
+
 /** Numbers with one value, or one per sheet side by side. */
 export function plainSheet(sheets, isWhole) {
   const rows = sheets[0].rows.filter((row) => isWhole || row.is_first);
   const head = sheets.length > 1 ? [make("div", { className: "row head" }, [make("span"), ...sheets.map(({ title }) => make("b", {}, [title]))])] : [];
   const lines = rows.map((row) => {
     const values = sheets.map((sheet) => sheet.rows.find(({ key }) => key === row.key)?.cells[0] ?? "–");
-    return make("div", { className: "row" }, [term(row), ...values.map((value) => make("b", {}, [value]))]);
+    return make("div", { className: "row" }, [term(row), ...values.map((value) => make("b", { className: isMissed(row, value) ? "bad" : "" }, [value]))]);
   });
   return make("div", { className: `sheet columns-${sheets.length}` }, [...head, ...lines]);
 }
@@ -37,7 +40,7 @@ export function changeSheet(sheet, isWhole, named) {
     rows.map((row) => {
       const columns = [cell("Before", "without a device", row.cells[0], "")];
       sheet.names.forEach((name, i) => columns.push(cell(named(name), sheet.devices[i], row.cells[1 + 2 * i], row.cells[2 + 2 * i], row.senses[i])));
-      return make("div", { className: "card" }, [term(row), make("div", { className: "card-cells" }, columns)]);
+      return make("div", { className: row.key.startsWith("neck_inflow_in_") ? "card beside" : "card" }, [term(row), make("div", { className: "card-cells" }, columns)]);
     }),
   );
 }
@@ -69,15 +72,23 @@ export function sureSheet({ title, words, rows }) {
   return [make("h2", { className: "sure" }, [`Uncertainty: ${title}`]), make("p", { className: "hint" }, [words]), make("div", { className: "cards" }, cards)];
 }
 
-/** Where a device lies, in words with their bands. */
-export function placeWords({ length_mm, length_band_mm, ends_mm, ends_band_mm }) {
-  const band = ([low, high]) => `between ${low.toFixed(1)} and ${high.toFixed(1)} mm`;
+/** How far an end of a device, proximal (0) or distal (1), reaches beyond the neck; it is negative where it does not reach it. */
+export const reachOf = (i, mm, neck) => (neck?.length ? (i ? mm - neck[1] : neck[0] - mm) : undefined);
+
+/** The same in words; from the inlet without a neck. */
+export function reachWords(i, mm, neck) {
+  const reach = reachOf(i, mm, neck);
+  return reach === undefined ? `${mm.toFixed(1)} mm from inlet` : `${Math.abs(reach).toFixed(1)} mm ${reach < 0 ? "short of" : "beyond"} neck`;
+}
+
+/** Where a device lies, in words; its length with its band, once there is one. */
+export function placeWords({ length_mm, ends_mm }, bands, neck) {
+  const [, , low, high, cause] = bands?.rows.find(([name]) => name === "Deployed length") || [];
   const rows = [
-    ["Deployed length", `${length_mm.toFixed(1)} mm`, band(length_band_mm)],
-    ["Proximal end", `${ends_mm[0].toFixed(1)} mm`, band(ends_band_mm[0])],
-    ["Distal end", `${ends_mm[1].toFixed(1)} mm`, band(ends_band_mm[1])],
+    ["Deployed length", `${length_mm.toFixed(1)} mm`, low ? `${low} to ${high}${cause ? `: ${cause}` : ""}` : "", false],
+    ...["Proximal end", "Distal end"].map((name, i) => [name, reachWords(i, ends_mm[i], neck), "", reachOf(i, ends_mm[i], neck) < 0]),
   ];
-  return rows.map(([name, value, range]) => make("div", { className: "row" }, [make("span", {}, [name]), make("b", {}, [value]), make("small", {}, [range])]));
+  return rows.map(([name, value, range, isShort]) => make("div", { className: "row" }, [make("span", {}, [name]), make("b", { className: isShort ? "bad" : "" }, [value]), make("small", {}, [range])]));
 }
 
 /** How sure a device is: a sentence, and the band of each result with its largest cause. */

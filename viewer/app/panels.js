@@ -19,12 +19,26 @@ function state(page) {
   const { failed, steps, job, has_anatomy, wants_grid } = page.view;
   const words = page.step === "image" ? "You have changed a setting since this vessel was found." : "You have changed an earlier step. What you see was computed before the change.";
   const isCurrent = ["image", "vessel", "sac"].every((step) => steps[step] === "done");
-  const isFound = ["image", "vessel", "sac"].includes(page.step) && !job && !isCurrent && !wants_grid;
+  const isFound = ["image", "vessel", "sac"].includes(page.step) && !job && !isCurrent && !wants_grid && !page.asksForAneurysm;
   return [
-    ...(failed[page.step] ? [make("p", { className: "note failed", role: "alert" }, [failed[page.step]])] : []),
+    ...(failed[page.step] && !page.asksForAneurysm ? [make("p", { className: "note failed", role: "alert" }, [failed[page.step]])] : []),
     ...(steps[page.step] === "stale" && !["device", "deploy"].includes(page.step) ? [make("p", { className: "note stale" }, [words])] : []),
     ...(isFound ? [main(has_anatomy ? "Find the vessel again" : "Find the vessel", () => page.start("anatomy"))] : []),
   ];
+}
+
+/** The question where no aneurysm was found, in place of what a step offers. */
+function question(page) {
+  const none = async () => {
+    await page.choose({ without_aneurysm: true });
+    page.start("anatomy");
+  };
+  const isHere = page.step === "sac";
+  return make("div", { className: "note failed question", role: "alert" }, [
+    make("h3", {}, ["No aneurysm found"]),
+    make("p", {}, [isHere ? "Click on the vessel where it is, or go back to the image." : "No device is proposed or deployed until you have said where it is."]),
+    ...(isHere ? [button("← Image", () => page.go("image"), { className: "wide" }), button("There is none: use the artery as it is", none, { className: "wide" })] : [button("Show where it is", () => page.go("sac"), { className: "wide" })]),
+  ]);
 }
 
 /** A word where the vessel itself is out of date. */
@@ -129,7 +143,9 @@ export const panels = {
   },
 
   sac(page) {
-    const parts = [...title("Sac and parent", "The sac (red) is taken off along its neck; the artery beneath it (sand) is what a device opens against. Drag the points on the neck to draw it anew; click a sac to choose it.")];
+    const parts = page.asksForAneurysm ? title("Sac and parent", "No device is proposed or deployed until you have said where the aneurysm is.") : [...title("Sac and parent", "The sac (red) is taken off along its neck; the artery beneath it (sand) is what a device opens against. Drag the points on the neck to draw it anew; click a sac to choose it.")];
+    if (page.asksForAneurysm) parts.push(question(page));
+    if (page.view.choices.without_aneurysm) parts.push(make("div", { className: "given" }, [make("span", {}, ["The artery has no aneurysm."]), link("Ask again", () => page.choose({ without_aneurysm: false }))]));
     if (page.anatomy) parts.push(parentOutlet(page));
     if (page.anatomy?.drawn.curve_mm.length) parts.push(make("div", { className: "place" }, page.neckPlace), ...(page.view.choices.neck_mm ? [given(page, "neck_mm", "The neck was drawn by hand.")] : []));
     parts.push(...point(page, "at_mm", "Seed"), ...state(page), ...notes(page));
@@ -139,6 +155,7 @@ export const panels = {
 
   device(page) {
     const { job, choices, has_ranking } = page.view;
+    if (page.asksForAneurysm) return [...title("Device", "Which devices and sizes suit this artery."), question(page)];
     const chosen = choices.treatments;
     const parts = [...title("Device", "Choose up to three devices to compare. Every size of each is deployed in this artery and ranked."), ...earlier(page)];
     const others = chosen.filter((treatment) => !isOfDevice(treatment));
@@ -151,13 +168,14 @@ export const panels = {
 
   deploy(page) {
     const { treatment, implant } = page;
+    if (page.asksForAneurysm) return [...title("Deploy", "A device in the artery."), question(page)];
     const parts = [...title("Deploy", "Drag either end along the artery. The deployed length follows, because the wires cannot stretch."), ...earlier(page)];
     if (!treatment) return [...parts, make("p", { className: "note" }, ["Choose a device first."]), next(page, "device", "← Device")];
     const isHere = (told) => told?.treatment === treatment.name && told.implant === implant.id;
     parts.push(...shownTabs(page), ...sizes(page));
     const colour = "Colour of the wires";
     parts.push(
-      make("div", { className: "place" }, isHere(page.place) ? placeWords(page.place) : []),
+      make("div", { className: "place" }, isHere(page.place) ? placeWords(page.place, isHere(page.bands) ? page.bands : null, page.anatomy.neck) : []),
       make("div", { className: "bands" }, isHere(page.bands) ? bandWords(page.bands) : []),
       make("div", { className: "label" }, [colour]),
       tabs(colour, page.colour, [["wall_gap", "Wall gap"], ["coverage", "Coverage"], ["diameter", "Diameter"]], (id) => page.show({ colour: id })),
@@ -173,6 +191,7 @@ export const panels = {
   flow(page) {
     const { choices, job, steps } = page.view;
     const { flow } = choices;
+    if (page.asksForAneurysm) return [...title("Blood flow", "The flow without a device, then with each."), question(page)];
     const parts = [...title("Blood flow", "The flow without a device, then with each. All pictures share one camera and one scale.")];
     parts.push(
       number("inflow", "Mean inflow", "mL/s", flow.inflow_mL_s, (value) => page.chooseFlow({ inflow_mL_s: value }), { min: leastOf(page, "inflow_mL_s"), placeholder: proposal(page.proposed?.inflow_mL_s, 2) }),
@@ -202,7 +221,7 @@ export const panels = {
       parts.push(make("p", { className: "hint" }, ["Deploys every device many times with varied threshold, landing and device diameter. The report then shows a 95 % interval for each result and its main causes."]));
       if (steps.report !== "done" && steps.flow === "done" && !job) parts.push(main("Write the report again", () => page.start("flow")));
     }
-    if (steps.flow !== "done") {
+    if (steps.flow !== "done" && job?.kind !== "angiogram") {
       parts.push(make("p", { className: "note" }, ["The report is written when the flow has been computed."]), next(page, "flow", "← Flow"));
     }
     parts.push(make("p", { className: "hint" }, [`The files are in ${page.view.folder}.`]));

@@ -339,7 +339,7 @@ export class Picture {
     const [x, y, depth] = (mark.at = this.onScreen(point));
     mark.element.style.setProperty("--nearness", Math.round(1e6 * (1 - depth)));
     mark.element.style.transform = `translate(${x}px, ${y}px)`;
-    mark.element.classList.toggle("flipped", x > this.area.clientWidth - 170);
+    mark.element.classList.toggle("flipped", x > this.area.clientWidth - 180);
   }
 
   /** Pixel in the first visible pane where a point of the world is seen, and its depth from -1, near, to 1. */

@@ -14,14 +14,16 @@ const FORMATS = {
   flow_uncertainty_fraction: (v) => `${(100 * v).toFixed(1)} %`, flow_grade: (v) => v,
 };
 const FIRST = [
-  ["rank", "No.", "Place in the ranking: of every device the size that a run proposes, then the others by their score. Ruled-out sizes come last."],
+  ["rank", "No.", "Place in the ranking, by score. Ruled-out sizes come last."],
   ["device", "Device", "Name in the catalogue."],
   ["label_diameter_mm", "Size, mm", "Label diameter × label length."],
   ["score", "Score", "Weighted mean of the criteria, 0 to 100; the last column says what lowers it."],
 ];
 const LAST = ["reason", "Why", "What lowers the score most, or why the size is ruled out."];
-const COSTS = "Largest deductions from a score of 1: ";
+const COSTS = "Largest deductions from 100: ";
 const MOST_ROWS = 200;
+/** Whether a size fits into the artery. */
+const isDeployed = (row) => row.deployed_length_mm !== undefined;
 
 export class Ranking {
   constructor(page) {
@@ -64,7 +66,7 @@ export class Ranking {
     const suits = rows.filter((row) => row.is_suitable).length;
     const head = make("div", { className: "ranking-head" }, [
       make("b", {}, ["Sizes"]),
-      make("span", {}, [`${rows.length} deployed, ${suits} suitable, ${shown.length} shown`]),
+      make("span", {}, [`${rows.filter(isDeployed).length} of ${rows.length} deployed, ${suits} suitable, ${shown.length} shown`]),
       ...(is_current ? [] : [make("span", { className: "note stale" }, ["of an earlier choice: rank again"])]),
       ...this.filters(),
       this.comparing.button(),
@@ -132,7 +134,7 @@ export class Ranking {
     const cells = [
       make("td", { className: "compare" }, [this.comparing.tick(row, `${name} ${size}`)]),
       make("td", { className: "rank" }, [String(row.rank)]),
-      make("td", {}, [name]),
+      make("td", {}, [name, ...(row.is_proposed ? [" ", make("small", { title: "A run proposes this size of the device." }, ["proposed"])] : [])]),
       make("td", {}, [make("button", { type: "button", className: "link", title: "Choose this size and see it deployed" }, [size])]),
       make("td", { className: "score-cell", title: `${(100 * row.score).toFixed(0)} of 100` }, [score, make("span", {}, [row.is_suitable ? (100 * row.score).toFixed(0) : "out"])]),
       ...(this.found.columns || []).map(({ key }) => make("td", {}, [row[key] === undefined ? "–" : FORMATS[key](row[key])])),

@@ -105,10 +105,15 @@ async function upload(files, said) {
   said.textContent = "Reading …";
   const name = files.length > 1 ? "scan" : files[0].name.replace(/(\.[A-Za-z]+)+$/, "") || "case";
   const { id } = await post("/api/cases", { name });
-  for (const [i, file] of files.entries()) {
-    said.textContent = files.length > 1 ? `Reading file ${i + 1} of ${files.length} …` : `Reading ${file.name} …`;
-    await put(`/api/cases/${id}/input?name=${encodeURIComponent(file.name)}`, file);
+  try {
+    for (const [i, file] of files.entries()) {
+      said.textContent = files.length > 1 ? `Reading file ${i + 1} of ${files.length} …` : `Reading ${file.name} …`;
+      await put(`/api/cases/${id}/input?name=${encodeURIComponent(file.name)}`, file);
+    }
+    await post(`/api/cases/${id}/input/done`);
+  } catch (problem) {
+    await remove(`/api/cases/${id}`).catch(() => {}); // no case is left of files that cannot be read
+    throw problem;
   }
-  await post(`/api/cases/${id}/input/done`);
   return id;
 }

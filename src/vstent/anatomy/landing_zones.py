@@ -20,6 +20,20 @@ def neck_span_mm(anatomy: Anatomy) -> tuple[float, float]:
     return middle_mm, middle_mm
 
 
+def beside_neck(anatomy: Anatomy, abscissa_mm: float) -> str:
+    """Say where a place on the parent axis is, from the nearer end of the neck; from the inlet without a neck."""
+    if not anatomy.aneurysms:
+        return f"{abscissa_mm:.1f} mm from the inlet"
+    proximal_mm, distal_mm = neck_span_mm(anatomy)
+    if abscissa_mm < proximal_mm:
+        return f"{proximal_mm - abscissa_mm:.1f} mm proximal to the neck"
+    if abscissa_mm > distal_mm:
+        return f"{abscissa_mm - distal_mm:.1f} mm distal to the neck"
+    if abscissa_mm - proximal_mm < distal_mm - abscissa_mm:
+        return f"{abscissa_mm - proximal_mm:.1f} mm distal to the proximal end of the neck"
+    return f"{distal_mm - abscissa_mm:.1f} mm proximal to the distal end of the neck"
+
+
 def neck_points_mm(anatomy: Anatomy) -> Floats:
     """Return the vertices (n, 3) of the largest aneurysm's neck in mm; empty without an aneurysm."""
     if not anatomy.aneurysms:

@@ -115,7 +115,7 @@ def dependencies(state: State) -> dict[str, str]:
     parts: dict[str, Any] = {
         "image": [state.source, *(chosen[name] for name in OF_IMAGE)],
         "vessel": [chosen[name] for name in ("inlet_mm", "upstream_mm", "downstream_mm")],
-        "sac": [chosen["outlet_mm"], chosen["neck_mm"]],
+        "sac": [chosen["outlet_mm"], chosen["neck_mm"], chosen["without_aneurysm"]],
         "device": treatments,
         "deploy": placings,
         "flow": chosen["flow"],

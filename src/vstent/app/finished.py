@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from vstent.app.cases import STEPS, Case, Cases, State, dependencies
 from vstent.app.choices import Choices
+from vstent.devices.treatment import BARE
 from vstent.errors import InputError, ReadError
 
 if TYPE_CHECKING:  # imported when a folder is read, as in `vstent.app.choices`
@@ -35,6 +36,17 @@ def kept_flows(folder: Path) -> dict[str, Path]:
     return paths if all(path.is_file() for path in paths.values()) else {}
 
 
+def shown_flows(folder: Path, state: State) -> dict[str, Path]:
+    """Return the files of the flows to show by name: while they are computed, those that are finished."""
+    if state.job != "flow":
+        return kept_flows(folder)
+    try:
+        paths = _flows_wanted(folder, _given(state))
+    except InputError:  # a device that does not exist: the job says so
+        return {}
+    return {name: path for name, path in paths.items() if path.is_file() and paths[BARE].is_file()}
+
+
 def kept_histories(folder: Path) -> dict[str, Path]:
     """Return the stored contrast of all flows of the last finished study by name; empty where one is missing."""
     flows = kept_flows(folder)
@@ -50,9 +62,13 @@ def lost_steps(folder: Path, state: State) -> set[str]:
     if not (folder / REPORT).is_file():
         lost.add("report")
     if state.choices.flow.is_wanted and flows and state.done.get("flow") == keys["flow"]:
-        given = state.model_dump_json(include={"name", "source", "former", "choices"})
-        lost |= {"flow", "report"} if flows != _flows_wanted(folder, given) else set()
+        lost |= {"flow", "report"} if flows != _flows_wanted(folder, _given(state)) else set()
     return lost
+
+
+def _given(state: State) -> str:
+    """Return what the flows of a case depend on, as JSON."""
+    return state.model_dump_json(include={"name", "source", "former", "choices"})
 
 
 @lru_cache(maxsize=REMEMBERED)

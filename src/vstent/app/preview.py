@@ -20,7 +20,7 @@ from vstent.app.cases import Case
 from vstent.app.choices import Point
 from vstent.app.cuts import cut
 from vstent.app.films import films_message, kept_curves
-from vstent.app.finished import kept_flows, kept_histories
+from vstent.app.finished import kept_histories, shown_flows
 from vstent.app.scans import LOCK
 from vstent.deployment.contour import planes
 from vstent.deployment.deploy import propose_landing
@@ -30,7 +30,7 @@ from vstent.deployment.sketch import MeasuredWall, Sketch, measured_wall, sketch
 from vstent.devices.catalogue import find_design
 from vstent.devices.formulas import coverage_fraction, free_diameters_mm
 from vstent.devices.stent import Deployment, Landing, Stent
-from vstent.devices.treatment import BARE, Implant, Treatment
+from vstent.devices.treatment import BARE, Implant, Treatment, with_device
 from vstent.errors import InputError, ReadError, VstentError
 from vstent.flow.case import FlowField
 from vstent.flow.domain import default_cell_size_mm
@@ -59,7 +59,7 @@ from vstent.reporting.scene import (
 )
 from vstent.reporting.uncertainty import band_rows, how_sure
 from vstent.study.folder import CACHE
-from vstent.study.stages import bands_of, deploy_implant, landing_of, on_path, size_of
+from vstent.study.stages import ask_for_aneurysm, bands_of, deploy_implant, landing_of, on_path, size_of
 
 Colour = Literal["wall_gap", "coverage", "diameter"]
 """Quantity that colors the wires."""
@@ -146,10 +146,15 @@ class Preview:
         """Return a deployed implant; those that it opens inside are deployed before it."""
 
         def deploy() -> Deployment:
+            self._ask(treatment)
             inside = [self.deployment(treatment, _implant(treatment, name)).stent for name in implant.inside]
             return deploy_implant(implant, self.anatomy, inside)
 
         return self._of_implant("deployment", treatment, implant, deploy)
+
+    def _ask(self, *treatments: Treatment) -> None:
+        """Raise VesselError where there is no aneurysm, and a device would get a proposed place nevertheless."""
+        ask_for_aneurysm(self.anatomy, replace(self.case.state.settings(), treatments=treatments))
 
     def deployed(self, treatment: Treatment) -> dict[str, Deployment]:
         """Return the deployed implants of a treatment by id."""
@@ -284,6 +289,10 @@ class Preview:
             ],
             notes=[*anatomy.vessel.notes, *anatomy.notes],
             neck=span_mm,
+            sacs=[
+                {"center_mm": one.sac.vertices_mm.mean(axis=0).tolist(), "volume_mm3": one.sac.volume_mm3}
+                for one in anatomy.aneurysms
+            ],
             drawn=necks.told(necks.curve_of(anatomy)),
         )
 
@@ -311,10 +320,12 @@ class Preview:
             sizes = {}
             for key in devices:
                 with suppress(VstentError):
+                    self._ask(with_device(key))
                     sizes[key] = size_of(Implant(key, key), self.anatomy).label
             return {"inflow_mL_s": case.inflow_mL_s, "cell_size_mm": default_cell_size_mm(case), "sizes": sizes}
 
-        return self._cached(("proposed", self.case.state.anatomy, *devices), propose)
+        is_without = self.case.state.choices.without_aneurysm
+        return self._cached(("proposed", self.case.state.anatomy, is_without, *devices), propose)
 
     def sketch_message(self, treatment: Treatment, implant: str, landing: Landing | None, colour: Colour) -> bytes:
         """Return the wires of an implant at its expected position, with the others of its treatment as deployed.
@@ -322,6 +333,7 @@ class Preview:
         The implant is drawn as if it opened against the wall of the artery, at a landing; None: at the chosen one, or
         at the proposed one where none is chosen.
         """
+        self._ask(treatment)
         with LOCK:
             pane, chosen = treatment.name, _implant(treatment, implant)
             wall, anatomy = self._wall(chosen), on_path(self.anatomy, chosen.placing.path)
@@ -374,7 +386,7 @@ class Preview:
         Raises ReadError: flows are missing.
         """
         with LOCK:
-            paths = kept_flows(self.case.folder)
+            paths = shown_flows(self.case.folder, self.case.state)
             if not paths:
                 raise ReadError("Some flows of these results are missing. Run the step Flow.")
             layers = [layer for name, path in paths.items() for layer in self._flow_layers(name, path, moment)]

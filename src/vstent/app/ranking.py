@@ -6,16 +6,18 @@ from typing import Any, Final
 from vstent.app.cases import Case
 from vstent.app.jobs import RANKING
 from vstent.devices.catalogue import find_design
+from vstent.devices.treatment import BARE, Placing, Treatment
+from vstent.flow.case import FlowField
 from vstent.flow.settings import FlowSettings
 from vstent.io.writers import write_json
-from vstent.plan.rank import Ranking, rank
+from vstent.plan.rank import Candidate, Ranking, rank
 from vstent.plan.rank_flow import rank_flows
 from vstent.reporting.definitions import DEFINITIONS
 from vstent.study.folder import CACHE
-from vstent.study.keys import ANATOMY, anatomy_keys
+from vstent.study.keys import ANATOMY, study_keys
 from vstent.study.progress import OnProgress, Progress
 from vstent.study.ranking_flows import FlowStore
-from vstent.study.stages import find_anatomy
+from vstent.study.stages import ask_for_aneurysm, find_anatomy
 from vstent.study.store import Key, Store
 
 MOST_PROCESSES: Final = 4
@@ -47,9 +49,10 @@ def rank_sizes(case: Case, progress: OnProgress) -> None:
     Raises InputError: no device is chosen, or flows are wanted and there is no sac or no suitable size.
     Raises FlowError: the flow without a device cannot be computed.
     """
-    settings = case.state.settings()
-    keys = anatomy_keys(case.state.source, settings)
-    anatomy = find_anatomy(case.input, settings, Store(case.folder / CACHE, progress), keys)
+    settings, store = case.state.settings(), Store(case.folder / CACHE, progress)
+    keys = study_keys(case.state.source, settings)
+    anatomy = find_anatomy(case.input, settings, store, keys)
+    ask_for_aneurysm(anatomy, settings)
 
     def told(n_done: int, n_all: int) -> None:
         progress(Progress("rank", min(n_done / n_all, 0.99), f"{n_done} of {n_all} sizes"))
@@ -69,9 +72,26 @@ def rank_sizes(case: Case, progress: OnProgress) -> None:
         def told_flow(n_done: float, n_all: int, name: str) -> None:
             progress(Progress("rank_flow", min(n_done / n_all, 0.99), f"{n_done} of {n_all}: {name}"))
 
+        def keep(candidate: Candidate | None, field: FlowField) -> None:
+            """Store a flow of the chosen treatments as that of the study, so that the step Flow finds it."""
+            names = [BARE] if candidate is None else [one.name for one in settings.treatments if _is_of(one, candidate)]
+            for stage in (f"flow {name}" for name in names if f"flow {name}" in keys):
+                store.save(stage, keys[stage], field)
+
         stored = FlowStore(case.folder, key, flow)
-        _write(case, key, rank_flows(anatomy, found, flow, n_flows, stored=stored, progress=told_flow))
+        _write(case, key, rank_flows(anatomy, found, flow, n_flows, stored=stored, keep=keep, progress=told_flow))
         progress(Progress("rank_flow", 1.0))
+
+
+def _is_of(treatment: Treatment, candidate: Candidate) -> bool:
+    """Return whether a candidate is what a treatment deploys: its only device, in this size at the proposed place."""
+    implant = treatment.implants[0]
+    given = implant.diameter_mm, implant.length_mm
+    is_size = given == (candidate.size.diameter_mm, candidate.size.length_mm) or (
+        given == (None, None) and candidate.is_proposed
+    )
+    is_alone = len(treatment.implants) == 1 and treatment.has_flow and implant.placing == Placing()
+    return is_alone and is_size and implant.device == candidate.design.key and candidate.shift_mm == 0
 
 
 def _write(case: Case, anatomy: Key, found: Ranking) -> None:

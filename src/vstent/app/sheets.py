@@ -26,6 +26,7 @@ FIRST: Final = {
     ),
     "device": (
         "deployed_length_mm",
+        "neck_covered_fraction",
         "neck_metal_coverage_fraction",
         "apposed_fraction",
         "max_wall_gap_mm",
@@ -39,8 +40,14 @@ FIRST: Final = {
 
 
 def anatomy(measures: dict[str, Any]) -> list[Sheet]:
-    """Return the table of the vessel."""
-    return [_plain("Anatomy", flatten(measures), FIRST["anatomy"])]
+    """Return the table of the vessel with its largest sac, and one of every other sac."""
+    others = {key: value for key, value in measures.items() if isinstance(value, dict)}
+    largest = {key: value for key, value in measures.items() if key not in others}
+    titles = [f"Sac {number}" for number in range(1, len(others) + 2)]
+    return [
+        _plain(title, flatten(one), FIRST["anatomy"])
+        for title, one in zip(titles, (largest, *others.values()), strict=True)
+    ]
 
 
 def device(title: str, measures: dict[str, Any]) -> Sheet:

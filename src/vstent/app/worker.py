@@ -45,11 +45,14 @@ def progress(now: Progress) -> None:
 
 
 def find_anatomy(case: Case) -> None:
-    """Find vessel, sac, neck and parent artery."""
+    """Find vessel, sac, neck and parent artery; VesselError is raised where the user must say where the sac is."""
     from vstent.study.pipeline import restore_vessel
+    from vstent.study.stages import ask_for_aneurysm
 
-    restore_vessel(case.input, case.folder, case.state.settings(), progress, replaces=True)
+    settings = case.state.settings()
+    anatomy, _ = restore_vessel(case.input, case.folder, settings, progress, replaces=True)
     tell(anatomy=_anatomy_key(case))
+    ask_for_aneurysm(anatomy, settings)
 
 
 def _anatomy_key(case: Case) -> str:

@@ -10,11 +10,11 @@ from typing import Any, Final
 from vstent.app import intake
 from vstent.app.cases import STATE, STEPS, Case, Cases, dependencies, failures, statuses
 from vstent.app.choices import pulse_of
-from vstent.app.finished import REPORT, RUN, kept_flows, kept_histories, lost_steps, reopened
+from vstent.app.finished import REPORT, RUN, kept_histories, lost_steps, reopened, shown_flows
 from vstent.app.jobs import KINDS, RANKING, Jobs
 from vstent.devices.treatment import BARE, Treatment
 from vstent.errors import InputError, ReadError
-from vstent.io.files import atomic, existing, suffix
+from vstent.io.files import atomic, existing, state_of, suffix
 
 PICTURE: Final = ".picture.png"
 """File of a case folder with its picture in the list of cases."""
@@ -90,6 +90,7 @@ class Workspace:
     def view(self, case: Case) -> dict[str, Any]:
         """Return the state of a case as clients read it."""
         state, job = case.state, self.jobs.running(case)
+        flows = shown_flows(case.folder, state)
         return {
             "id": case.id,
             "name": state.name,
@@ -109,7 +110,8 @@ class Workspace:
             "has_report": (case.folder / REPORT).is_file(),
             "has_pdf": (case.folder / "report.pdf").is_file(),
             "has_ranking": (case.folder / RANKING).is_file(),
-            "has_flow": bool(kept_flows(case.folder)),
+            "has_flow": bool(flows),
+            "results": f"{' '.join(flows)} {state_of(case.folder / 'metrics.json')}",
             "has_angiogram": bool(kept_histories(case.folder)),
             "job": job.told() if job else None,
         }
@@ -280,8 +282,8 @@ class Workspace:
         found: dict[str, Any] = {"anatomy": [], "flow": [], "uncertainty": []}
         if case.state.anatomy:
             found["anatomy"] = self.preview(case).anatomy_sheet()
-        path = case.folder / "metrics.json"
-        if path.is_file():
+        path, job = case.folder / "metrics.json", self.jobs.running(case)
+        if path.is_file() and not (job and job.kind == "flow" and path.stat().st_mtime < job.began):
             metrics = json.loads(path.read_text(encoding="utf-8"))
             titles = _titles(metrics, case)
             found |= {"flow": sheets.flow(metrics, titles), "uncertainty": sheets.uncertainty(metrics, titles)}

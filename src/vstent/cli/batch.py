@@ -54,5 +54,8 @@ def _batch(arguments: argparse.Namespace) -> int:
     console.print(f"Results in {', '.join(str(path) for path in [*written, out / 'cohort.html'])}.")
     if len(written) == 1:
         console.say("No Parquet file was written: it needs pyarrow (pip install 'vstent[parquet]').")
+    n_failed = sum(row["outcome"] != "done" for row in rows)
+    if n_failed:
+        console.say(f"{n_failed} of {len(rows)} rows are not done; the table states the reasons.")
     console.print("Research use only.")
-    return 0
+    return 1 if n_failed else 0

@@ -174,7 +174,7 @@ def _add_flow_rows(table: Table, metrics: Mapping[str, Any], titles: Mapping[str
     graded = {one.name: one for one in qualities(metrics, {name: name for name in treatments})}
     if graded:
         table.add_row(
-            "Grade of the flow", *(graded[name].grade if name in graded else "" for name in (BARE, *treatments))
+            "Grid and convergence", *(graded[name].grade if name in graded else "" for name in (BARE, *treatments))
         )
         reasons = (one.sentence for one in graded.values() if one.reasons)
         table.caption = "\n".join([f"Flow: {graded[BARE].computation}.", *reasons])
@@ -224,12 +224,13 @@ def ranking_table(ranking: Ranking, shown: int) -> Table:
         cells = ["" if measures.get(key) is None else form.format(measures[key]) for _, key, form in columns]
         if "deployed_length_low_mm" in measures:
             cells[0] += f" ({measures['deployed_length_low_mm']:.1f}-{measures['deployed_length_high_mm']:.1f})"
-        score = f"{candidate.score:.2f}" if candidate.is_suitable else "out"
-        table.add_row(str(number), candidate.label, f"{candidate.shift_mm:+g}", score, *cells)
+        score = f"{100 * candidate.score:.0f}" if candidate.is_suitable else "out"
+        label = f"{candidate.label}{' *' if candidate.is_proposed else ''}"
+        table.add_row(str(number), label, f"{candidate.shift_mm:+g}", score, *cells)
     table.columns[1].no_wrap = True
     table.caption = (
-        f"{len(ranking.candidates)} tried, {len(ranking.suitable)} suitable. First the size that vstent run "
-        "proposes for each device. In brackets: 95 % band from the ranges of the device's numbers."
+        f"{len(ranking.candidates)} tried, {len(ranking.suitable)} suitable; scores of 100. * is the size that vstent "
+        "run proposes. In brackets: 95 % band from the ranges of the device's numbers."
     )
     return table
 

@@ -45,6 +45,7 @@ def _rank(arguments: argparse.Namespace) -> int:
     from vstent.study.pipeline import restore_vessel
     from vstent.study.progress import Progress
     from vstent.study.ranking_flows import FlowStore, compute_missing, parallel_flows
+    from vstent.study.stages import ask_for_aneurysm
 
     is_cluster, count = bool(arguments.scheduler or arguments.slurm), arguments.flow_count
     if arguments.retention and not count:
@@ -64,6 +65,7 @@ def _rank(arguments: argparse.Namespace) -> int:
 
     with console.live():
         anatomy, _ = restore_vessel(arguments.input, out, settings, console.progress, replaces=arguments.replace)
+        ask_for_aneurysm(anatomy, settings)
         tried = {"criteria": criteria, "shifts_mm": arguments.shift, "jobs": arguments.jobs}
         ranking = rank(anatomy, designs, **tried, progress=told_sizes)
         if count:

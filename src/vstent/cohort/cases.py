@@ -70,7 +70,7 @@ def find_cases(cohort: Path, given: Mapping[str, Any]) -> tuple[Case, ...]:
     for device in {device for case in cases for device in case.settings.devices}:
         find_design(device)
     for flow in {case.settings.flow for case in cases}:
-        check_engine(flow)
+        check_engine(flow, runs_here=False)
     return tuple(cases)
 
 

@@ -4,7 +4,7 @@ from functools import lru_cache
 from math import inf
 from typing import Final
 
-from vstent.anatomy.landing_zones import neck_points_mm, neck_span_mm
+from vstent.anatomy.landing_zones import beside_neck, neck_points_mm, neck_span_mm
 from vstent.deployment.crumpling import crumpling, place_of_narrowest
 from vstent.deployment.method import Course
 from vstent.deployment.sizing import (
@@ -34,9 +34,9 @@ def advise(anatomy: Anatomy, stent: Stent, course: Course, gap_mm: Floats, is_at
     The gaps (rows, columns) are those between the device and the wall, which is the patient's own at some nodes.
     """
     lies = (
-        f"{stent.design.name} {stent.size.label} spans "
-        f"{stent.proximal_abscissa_mm:.1f}-{stent.distal_abscissa_mm:.1f} mm along the parent artery (deployed "
-        f"length {stent.deployed_length_mm:.1f} mm){_width(anatomy, stent)}{_reach(anatomy, stent)}"
+        f"{stent.design.name} {stent.size.label} reaches from {beside_neck(anatomy, stent.proximal_abscissa_mm)} to "
+        f"{beside_neck(anatomy, stent.distal_abscissa_mm)} (deployed length {stent.deployed_length_mm:.1f} mm)"
+        f"{_width(anatomy, stent)}{_reach(anatomy, stent)}"
     )
     is_loose = is_at_patient & (gap_mm > APPOSED_GAP_MM)
     loose = is_loose.sum() / max(is_at_patient.sum(), 1)
@@ -104,7 +104,7 @@ def _reach(anatomy: Anatomy, stent: Stent) -> str:
     short = f", {what} the {end} end of the neck"
     half_mm, center_mm = 0.5 * stent.deployed_length_mm, 0.5 * (proximal_mm + distal_mm)
     fits = half_mm < center_mm < anatomy.parent.axis.length_mm - half_mm
-    if fits and 0.5 * (before_mm + after_mm) >= wanted_mm:
+    if fits and 0.5 * (before_mm + after_mm) >= (wanted_mm if beyond_mm >= 0 else 0):  # what misses the neck is moved
         return f"{short} (move it {move})"
     same = [size for size in stent.design.sizes if size.diameter_mm == stent.size.diameter_mm]
     longer = [size for size in same if size.length_mm > stent.size.length_mm]

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from vstent.anatomy.landing_zones import neck_span_mm
+from vstent.anatomy.landing_zones import beside_neck
 from vstent.anatomy.morphology import Measures
 from vstent.deployment.contour import planes
 from vstent.deployment.coverage import pore_places
@@ -133,11 +133,4 @@ def place_of_narrowest(anatomy: Anatomy, found: Crumpling) -> str:
     side = f", on the {'inner' if found.inward > 0 else 'outer'} side of the bend"
     if abs(found.inward) < BESIDE:
         side = ", between the inner and the outer side of the bend" if found.inward else ""
-    if not anatomy.aneurysms:
-        return f"at {found.abscissa_mm:.1f} mm along the parent artery{side}"
-    beyond_mm = {
-        end: found.abscissa_mm - at_mm for end, at_mm in zip(("proximal", "distal"), neck_span_mm(anatomy), strict=True)
-    }
-    end = min(beyond_mm, key=lambda name: abs(beyond_mm[name]))
-    way = "proximal" if beyond_mm[end] < 0 else "distal"
-    return f"{abs(beyond_mm[end]):.1f} mm {way} to the {end} end of the neck{side}"
+    return f"{beside_neck(anatomy, found.abscissa_mm)}{side}"

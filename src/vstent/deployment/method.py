@@ -214,8 +214,8 @@ def check_landing(landing: Landing, artery_mm: float) -> None:
     """Raise a LandingError unless a landing point lies on an artery of length `artery_mm`."""
     if not 0 <= landing.abscissa_mm <= artery_mm:
         raise LandingError(
-            f"A landing at {landing.abscissa_mm:.1f} mm is not on the parent artery, which spans "
-            f"0-{artery_mm:.1f} mm. Give a position between them."
+            f"A landing at {landing.abscissa_mm:.1f} mm from the inlet is not on the parent artery, which is "
+            f"{artery_mm:.1f} mm long. Give a position in between."
         )
 
 
@@ -228,19 +228,14 @@ def check_inside(design: Design, size: Size, abscissa_mm: Floats, artery_mm: flo
     if first >= 0 and last <= artery_mm:
         return
     length_mm = last - first
-    lies = (
-        f"{design.name} {size.label} would span {first:.1f} to {last:.1f} mm of a parent artery of 0 to "
-        f"{artery_mm:.1f} mm"
-    )
+    lies = f"{design.name} {size.label}, {length_mm:.1f} mm long once deployed,"
     if length_mm > artery_mm:
-        raise LandingError(
-            f"{lies}: its deployed length of {length_mm:.1f} mm exceeds the artery. Choose a shorter size."
-        )
+        raise LandingError(f"{lies} exceeds the artery of {artery_mm:.1f} mm. Choose a shorter size.")
     end, by_mm = ("proximal", -first) if first < 0 else ("distal", last - artery_mm)
     move, sense = ("distally", 1) if first < 0 else ("proximally", -1)
     told_mm = np.ceil(by_mm / TOLD_MM) * TOLD_MM
     raise LandingError(
-        f"{lies}: it extends {told_mm:.1f} mm beyond the {end} end. Move it at least {told_mm:.1f} mm {move}, "
-        "or choose a shorter size.",
+        f"{lies} extends {told_mm:.1f} mm beyond the {end} end of the artery. Move it at least {told_mm:.1f} mm "
+        f"{move}, or choose a shorter size.",
         sense * (by_mm + SPARE_MM),
     )

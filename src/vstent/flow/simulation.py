@@ -13,7 +13,7 @@ import numpy as np
 
 from vstent import plugins
 from vstent.devices.stent import Deployment
-from vstent.errors import InputError
+from vstent.errors import InputError, PluginError
 from vstent.flow import sampling
 from vstent.flow.background import BackgroundWork
 from vstent.flow.case import FlowCase, FlowField, Level, Phase, Target
@@ -136,6 +136,12 @@ def engine_class(numerics: Numerics, *, is_pulsatile: bool) -> type[AbstractEngi
     engine = built_in.get(numerics.engine) or plugins.load(
         "vstent.engines", numerics.engine, built_in=", ".join(built_in)
     )
+    missing = getattr(engine, "__abstractmethods__", ("AbstractEngine as its base class",))
+    if missing:
+        raise PluginError(
+            f"The engine {numerics.engine} is incomplete: it lacks {', '.join(sorted(missing))}. Complete its package, "
+            f"or choose the engine {LATTICE}."
+        )
     if numerics.close_up and not engine.closes_up:
         raise InputError(
             f"the engine {numerics.engine} does not support a finer grid in the sac alone: switch it off "
@@ -149,10 +155,17 @@ def engine_class(numerics: Numerics, *, is_pulsatile: bool) -> type[AbstractEngi
     return engine
 
 
-def check_engine(flow: FlowSettings | None) -> None:
-    """Check that the engine of a flow, if there is one, supports its settings, and that a requested GPU is there."""
+def check_engine(flow: FlowSettings | None, *, runs_here: bool = True) -> None:
+    """Check that the engine of a flow, if there is one, supports its settings, and that its program and a GPU are here.
+
+    FlowError is raised where a flow that runs here needs a program that is not installed.
+    """
+    from vstent.flow.openfoam import program
+
     if flow is not None:
         engine_class(flow.numerics, is_pulsatile=flow.waveform is not None)
+        if flow.numerics.engine == OPENFOAM and runs_here:
+            program.find()
         if flow.numerics.device_gpu:
             require_gpu()
 

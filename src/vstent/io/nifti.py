@@ -17,6 +17,8 @@ HEADER_BYTES: Final = {348: "NIfTI-1", 540: "NIfTI-2"}
 """Size of the header in bytes, which is also its first number, and the version with that size."""
 MM_PER_UNIT: Final = {0: 1.0, 1: 1e3, 2: 1.0, 3: 1e-3}
 """Length in mm of the units of a NIfTI header, by their code; 0 states none, and is mm."""
+MOST_RATIO: Final = 1.5
+"""Largest ratio of the voxel edges of the sform to those of the header, which a gantry tilt changes."""
 ROUNDED: Final = 1e-7
 """Square of the scalar part of a quaternion up to which it is 0 but for rounding."""
 RAS_TO_LPS: Final = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -36,15 +38,24 @@ def read_nifti(path: Path, *, has_spacing: bool) -> Image:
     if is_analyze:  # it has other fields in the places of these
         header["sform_code"] = header["qform_code"] = header["xyzt_units"] = header["scl_slope"] = 0
     stored = _stored(header, existing(body), 0 if head != body else int(header["sizeof_hdr"]))
-    spacing = np.abs(np.array(header["pixdim"][1:4], dtype=np.float64))
-    if not has_spacing and not (np.isfinite(spacing).all() and (spacing > 0).all()):
-        raise UnitError(f"{path.name} does not state a voxel spacing above zero; give --spacing in mm.")
-    spacing = np.where(np.isfinite(spacing) & (spacing > 0), spacing, 1.0)
+    stated = np.abs(np.array(header["pixdim"][1:4], dtype=np.float64))
+    is_known = bool((np.isfinite(stated) & (stated > 0)).all())
+    spacing = np.where(np.isfinite(stated) & (stated > 0), stated, 1.0)
     code = int(header["xyzt_units"]) % 8
     if code not in MM_PER_UNIT and not has_spacing:
         raise UnitError(f"{path.name} has the length unit {code}, which NIfTI does not define. Give --spacing in mm.")
     with np.errstate(all="ignore"):  # a frame of huge numbers is refused later
         affine, notes = _affine(header, stored.shape, spacing)
+        ratio = np.linalg.norm(affine[:3, :3], axis=0) / spacing
+        is_contradicted = is_known and not (np.maximum(ratio, 1 / ratio) < MOST_RATIO).all()
+        has_sform = _sound(_sform(header)) is not None
+    if not has_spacing and not is_known and not has_sform:
+        raise UnitError(f"{path.name} does not state a voxel spacing above zero; give --spacing in mm.")
+    if not has_spacing and is_contradicted and not (spacing == 1).all():
+        raise UnitError(
+            f"{path.name} states two voxel spacings, {_edges(spacing)} (pixdim) and {_edges(spacing * ratio)} (sform); "
+            "give --spacing in mm."
+        )
     to_mm = np.diag([*[MM_PER_UNIT.get(code, 1.0)] * 3, 1.0])
     slope, intercept = float(header["scl_slope"]), float(header["scl_inter"])
     intercept = intercept if np.isfinite(intercept) else 0.0
@@ -53,6 +64,11 @@ def read_nifti(path: Path, *, has_spacing: bool) -> Image:
     if is_analyze:
         notes = ("Analyze files state no orientation: left, right, front and back are unknown.",)
     return Image(voxels, to_mm @ affine, notes=notes, is_oriented=not is_analyze)
+
+
+def _edges(spacing: Floats) -> str:
+    """Return voxel edges in words."""
+    return " x ".join(f"{edge:.3g}" for edge in spacing)
 
 
 def pair_of(path: Path) -> tuple[Path, Path]:
@@ -130,16 +146,7 @@ def _stored(header: Any, path: Path, least: int) -> NDArray[Any]:
 
 def _affine(header: Any, shape: tuple[int, ...], spacing: Floats) -> tuple[Floats, tuple[str, ...]]:
     """Return the affine (4, 4) from voxel to LPS in the unit of the file, and a note where its two frames differ."""
-    rows = np.stack([header[name] for name in ("srow_x", "srow_y", "srow_z")]).astype(np.float64)
-    stated = (
-        np.concatenate([rows, [[0, 0, 0, 1]]]) if int(header["sform_code"]) > 0 else None,
-        _qform(header, spacing),
-    )
-    # A frame is finite and has three independent axes.
-    sform, qform = (
-        frame if frame is not None and np.isfinite(frame).all() and np.linalg.det(frame[:3, :3]) != 0 else None
-        for frame in stated
-    )
+    sform, qform = _sound(_sform(header)), _sound(_qform(header, spacing))
     if sform is None or qform is None:
         frame = qform if sform is None else sform
         return np.diag([*spacing, 1.0]) if frame is None else RAS_TO_LPS @ frame, ()
@@ -149,6 +156,17 @@ def _affine(header: Any, shape: tuple[int, ...], spacing: Floats) -> tuple[Float
     how = "mirror each other: check left and right" if is_mirrored else f"differ by {apart / spacing.min():.0f} voxels"
     note = f"The two frames of the file (sform and qform) {how}. The sform is used."
     return RAS_TO_LPS @ sform, (note,) if is_mirrored or apart > spacing.min() else ()
+
+
+def _sound(frame: Floats | None) -> Floats | None:
+    """Return a frame (4, 4) that is finite and has three independent axes; else None."""
+    return frame if frame is not None and np.isfinite(frame).all() and np.linalg.det(frame[:3, :3]) != 0 else None
+
+
+def _sform(header: Any) -> Floats | None:
+    """Return the affine (4, 4) that the header states by its rows; None where it states none."""
+    rows = np.stack([header[name] for name in ("srow_x", "srow_y", "srow_z")]).astype(np.float64)
+    return np.concatenate([rows, [[0, 0, 0, 1]]]) if int(header["sform_code"]) > 0 else None
 
 
 def _qform(header: Any, spacing: Floats) -> Floats | None:

@@ -1,6 +1,7 @@
 """Read scans in this process: DICOM, NIfTI, NRRD, MetaImage, VTK images and raw voxels, as an `Image` in LPS mm."""
 
 import math
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -54,6 +55,8 @@ def read_scan(
         image = read_vtk_image(path, has_spacing=has_spacing)
     elif kind in IMAGE_SUFFIXES:
         image = read_itk(path, has_spacing=has_spacing)
+    elif kind == ".zip" or zipfile.is_zipfile(path):
+        raise ReadError(f"{path.name} is an archive. Unpack it, and give the folder or the file that it holds.")
     else:
         raise ReadError(
             f"{path.name} is not a scan that vstent reads. Give a DICOM folder or one of {', '.join(IMAGE_SUFFIXES)}."

@@ -54,12 +54,14 @@ def fields_of(path: Path) -> dict[str, str]:
         pairs = [line.partition(":") for line in lines[1:] if not line.startswith("#") and ":=" not in line]
         return {key.strip().lower().replace(" ", ""): value.strip() for key, _, value in pairs}
     words = [re.split(r"\s*[=:]\s*", line.strip(), maxsplit=1) for line in lines if line.strip()]
-    for key, *value in words:
+    for k, (key, *value) in enumerate(words):
         usual = _META_GEOMETRY.get(key.lower(), key)
         if not value:
             raise ReadError(f"{path.name} is damaged: its header has the line {key[:40]!r}. Copy or export it again.")
         if key != usual:
             raise ReadError(f"{path.name} has a field {key[:40]!r}, which readers skip. Write {usual} in its header.")
+        if key in _META_GEOMETRY.values() and any(key == other for other, *_ in words[:k]):
+            raise ReadError(f"{path.name} states {key} twice. Keep the right one in its header.")
     return dict(words)
 
 
@@ -75,12 +77,14 @@ def states_spacing(path: Path, fields: dict[str, str]) -> bool:
     return are_lengths([length for length in lengths if len(lengths) == 3 or length.lower() != "nan"][:3])
 
 
+_NUMBER: Final = re.compile(rb"\+?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+"""A positive number; `float` reads others too, such as 1_0, of which other libraries read a part only."""
+
+
 def are_lengths(words: Sequence[str | bytes]) -> bool:
-    """Return whether words are three finite numbers above zero."""
-    try:
-        return len(words) == 3 and all(0 < float(word) < float("inf") for word in words)
-    except ValueError:
-        return False
+    """Return whether words are three finite numbers above zero, as every library reads them."""
+    plain = [word if isinstance(word, bytes) else word.encode() for word in words]
+    return len(plain) == 3 and all(_NUMBER.fullmatch(word) and 0 < float(word) < float("inf") for word in plain)
 
 
 def holds_segments(path: Path) -> bool:

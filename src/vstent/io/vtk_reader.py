@@ -26,7 +26,7 @@ UNEVEN: Final = 1e-3
 HEAD_BYTES: Final = 1 << 16
 """Number of bytes that hold the header of a file."""
 _SPACING: Final = re.compile(
-    rb"<ImageData\b[^>]*\sSpacing\s*=\s*[\"']([^\"'>]*)|^\s*(?:SPACING|ASPECT_RATIO)[ \t]+([^\r\n]*)", re.M
+    rb"<ImageData\b[^>]*\sSpacing\s*=\s*[\"']([^\"'>]*)|^\s*(?i:SPACING|ASPECT_RATIO)[ \t]+([^\r\n]*)", re.M
 )
 """Spacing in the header of a VTK image, XML or legacy; VTK takes 1 where it cannot read one."""
 
@@ -109,7 +109,7 @@ def read_vtk_image(path: Path, *, has_spacing: bool) -> Image:
             affine[axis, axis], affine[axis, 3] = steps.mean(), places[0]
         return Image(voxels, affine)
     with path.open("rb") as file:
-        stated = _SPACING.search(file.read(HEAD_BYTES))
+        stated = _SPACING.search(re.sub(rb"<!--.*?-->", b"", file.read(HEAD_BYTES), flags=re.DOTALL))
     if not has_spacing and not (stated and are_lengths((stated[1] or stated[2]).split())):
         raise UnitError(f"{path.name} does not state a voxel spacing above zero; give --spacing in mm.")
     matrix = data.GetDirectionMatrix()

@@ -92,12 +92,12 @@ class Ranking:
         return [{"rank": number} | candidate.row for number, candidate in enumerate(self.candidates, start=1)]
 
 
-def order_of(row: Mapping[str, Any]) -> tuple[bool, bool, float, str, float, float, float]:
+def order_of(row: Mapping[str, Any]) -> tuple[bool, float, bool, str, float, float, float]:
     """Return the sort key of a row that puts the best first; ties are sorted by name, size and shift."""
     return (
         not row["is_suitable"],
-        not row.get("is_proposed"),
         -row["score"],
+        not row.get("is_proposed"),
         row["device"],
         row["label_diameter_mm"],
         row["label_length_mm"],
@@ -134,7 +134,7 @@ def rank(
     Returns
     -------
     Ranking
-        All candidates, suitable ones first: of every device the size that a run proposes, then the others by score.
+        All candidates, suitable ones first, each by decreasing score.
 
     Raises
     ------
@@ -248,4 +248,4 @@ def _reason(asked: Sequence[Criterion], grades: dict[str, float], measures: Meas
     costly = sorted((key for key in lost if lost[key] > TELLING), key=lambda key: -lost[key])[:TOLD]
     if not costly:
         return "Meets almost every criterion in full."
-    return f"Largest deductions from a score of 1: {'; '.join(f'{said[key]} (-{lost[key]:.2f})' for key in costly)}."
+    return f"Largest deductions from 100: {'; '.join(f'{said[key]} (-{100 * lost[key]:.0f})' for key in costly)}."

@@ -60,6 +60,7 @@ def rank_flows(
     *,
     has_contrast: bool = False,
     stored: Stored | None = None,
+    keep: Callable[[Candidate | None, FlowField], None] | None = None,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Ranking:
     """Compute the flow with the best candidates of a ranking, the best of every device among them.
@@ -77,6 +78,7 @@ def rank_flows(
     count : number of candidates that get a flow.
     has_contrast : whether contrast is carried through the flows, and its retention in the sac counts in the scores.
     stored : finished results by candidate; those that are there are not computed again, and new ones are added.
+    keep : called with every flow that a study would compute in the same way: without a device, or started from that.
     progress : called with the number of finished flows, the number of all, and the name of the next.
 
     Raises
@@ -93,7 +95,7 @@ def rank_flows(
         raise InputError("No size is suitable, so there is no flow to compute. Choose another device.")
     found: Stored = {} if stored is None else stored
     unfinished = [one for one in chosen if not is_finished(found.get(one), has_contrast)]
-    flows = _Flows(anatomy, settings, has_contrast, [coverage_of(one) for one in unfinished])
+    flows = _Flows(anatomy, settings, has_contrast, [coverage_of(one) for one in unfinished], keep)
     waiting: dict[Candidate | None, Callable[[], Mapping[str, Any]]] = {}
     criteria = ranking.criteria if has_contrast else None
     with BackgroundWork(settings.numerics) as background:
@@ -146,9 +148,16 @@ class _Flows:
     The devices, in the order in which they are computed, cover the neck by the fractions `coming`.
     """
 
-    def __init__(self, anatomy: Anatomy, settings: FlowSettings, has_contrast: bool, coming: list[float]) -> None:
+    def __init__(
+        self,
+        anatomy: Anatomy,
+        settings: FlowSettings,
+        has_contrast: bool,
+        coming: list[float],
+        keep: Callable[[Candidate | None, FlowField], None] | None,
+    ) -> None:
         self.anatomy, self.settings, self.has_contrast = anatomy, settings, has_contrast
-        self._coming = coming
+        self._coming, self._keep = coming, keep
         self._bare: FlowField | None = None
         self._done: list[tuple[float, FlowField]] = []
 
@@ -161,6 +170,8 @@ class _Flows:
         field, measured = flow_with(
             self.anatomy, candidate, self.settings, start=self._bare, similar=similar, has_contrast=self.has_contrast
         )
+        if self._keep is not None and field is not None and similar is None:
+            self._keep(candidate, field)
         if candidate is None:
             self._bare = field
         elif field is not None:

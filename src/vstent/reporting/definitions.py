@@ -45,9 +45,6 @@ OF_PULSE: Final = (
 
 WANTED: Final = {
     "neck_inflow_mL_s": -1,
-    "neck_inflow_in_sac_mL_s": -1,
-    "neck_inflow_in_artery_mL_s": -1,
-    "plane_inflow_mL_s": -1,
     "mean_sac_velocity_m_s": -1,
     "sac_kinetic_energy_J": -1,
     "turnover_time_s": 1,

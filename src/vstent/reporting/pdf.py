@@ -21,9 +21,9 @@ def as_pdf(told: Contents) -> bytes:
         )
         if told.headlines:
             paper.heading("Before and after")
+            _changes(paper, told, told.headlines)
             for one in told.qualities:
                 paper.text(f"{one.sentence} {one.computation.capitalize()}.")
-            _changes(paper, told, told.headlines)
             if told.is_pulse:
                 paper.text(OF_PULSE)
         else:

@@ -7,12 +7,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from vstent.anatomy.landing_zones import ZONE_MM, neck_span_mm
-from vstent.deployment.method import laid_inside
-from vstent.deployment.sketch import measured_wall, sketch
-from vstent.devices.stent import Deployment, Landing, Stent
-from vstent.errors import LandingError
+from vstent.devices.stent import Deployment, Stent
 from vstent.geometry.vessel import Anatomy
-from vstent.plan.rank import alternatives
+from vstent.plan.criteria import default_criteria
+from vstent.plan.rank import Candidate, alternatives, graded_anew, landing_measures
 from vstent.reporting.figures import Picture, Plate, wire_shots
 from vstent.reporting.paper import QUIET, Paper
 from vstent.reporting.quantities import format_value
@@ -59,7 +57,7 @@ def plan_pdf(case: Planned) -> bytes:
                 deployment=deployment,
                 metrics=case.metrics[name][key],
                 picture=_picture(case, name),
-                others=_alternative_rows(case, deployment.stent),
+                others=_size_rows(case, deployment.stent, case.metrics[name][key]),
             )
             for name, key, title, deployment in titled(case.implants)
         ]
@@ -103,8 +101,8 @@ def _write(
         paper.text(f"– {sentence}", 8)
     if len(warnings) > 1 + MOST_NOTES:
         paper.text(f"{len(warnings) - 1 - MOST_NOTES} more notes are in the report.", 8, color=QUIET)
-    paper.heading("Alternative sizes")
-    paper.table(others, (0.17, 0.13, 0.70), head=("Size", "Score", "Reason"))
+    paper.heading("This size and alternatives")
+    paper.table(others, (0.20, 0.13, 0.67), head=("Size", "Score of 100", "Reason"))
     paper.text("Blood flow is not part of this plan. Name, date, signature: ______________________________", 8.5)
 
 
@@ -120,12 +118,8 @@ def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str,
     stent = deployment.stent
     rows = [
         ("Device and label size", f"{stent.design.name} {stent.size.label}"),
-        ("Deployed length (range for the uncertainty of diameters)", _length(anatomy, deployment)),
-        ("Position along the parent artery", f"{stent.proximal_abscissa_mm:.1f} to {stent.distal_abscissa_mm:.1f} mm"),
+        ("Deployed length", f"{stent.deployed_length_mm:.1f} mm {ends(metrics, 'deployed_length_mm')}".rstrip()),
     ]
-    band = ends(metrics, "deployed_length_mm")
-    if band:
-        rows.append(("Deployed length, band from the ranges of the device's numbers", band[1:-1]))
     first_mm, last_mm = anatomy.parent.own_mm
     proximal_mm, distal_mm = neck_span_mm(anatomy)
     zones_mm = {
@@ -152,23 +146,10 @@ def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str,
     ]
 
 
-def _length(anatomy: Anatomy, deployment: Deployment) -> str:
-    """Return the deployed length with its range."""
-    stent = deployment.stent
-    try:
-        found = laid_inside(
-            partial(sketch, measured_wall(stent.design, stent.size, anatomy)), Landing(stent.middle_abscissa_mm)
-        )
-    except LandingError:
-        return f"{stent.deployed_length_mm:.1f} mm"
-    lengths = sorted(b - a for a, b in zip(found.proximal_band_mm, found.distal_band_mm, strict=True))
-    shift = stent.deployed_length_mm - found.stent.deployed_length_mm
-    return f"{stent.deployed_length_mm:.1f} mm ({lengths[0] + shift:.1f} to {lengths[-1] + shift:.1f} mm)"
-
-
-def _alternative_rows(case: Planned, stent: Stent) -> Sequence[tuple[str, str, str]]:
-    """Return the two best neighboring sizes of a device."""
-    found = alternatives(case.anatomy, stent.design, stent.size)
-    return [(one.size.label, f"{one.score:.2f}" if one.is_suitable else "unsuitable", one.reason) for one in found] or [
-        ("none fits", "", "")
-    ]
+def _size_rows(case: Planned, stent: Stent, metrics: Mapping[str, Any]) -> Sequence[tuple[str, str, str]]:
+    """Return the size of a device as it lies and its two best neighboring sizes, with their scores and reasons."""
+    measures = {**metrics, **landing_measures(case.anatomy, dict(metrics))}
+    own = graded_anew(Candidate(stent.design, stent.size, 0.0, measures, {}, 0.0, False, ""), default_criteria())
+    found = [(f"{own.size.label} (this)", own)]
+    found += [(one.size.label, one) for one in alternatives(case.anatomy, stent.design, stent.size)]
+    return [(title, f"{100 * one.score:.0f}" if one.is_suitable else "unsuitable", one.reason) for title, one in found]

@@ -21,7 +21,7 @@ class Quality(NamedTuple):
     name: str
     """Name of the treatment."""
     title: str
-    """Display name."""
+    """What is graded, with the display name of the treatment."""
     grade: str
     """``good``, ``fair`` or ``not usable``."""
     reasons: str
@@ -43,15 +43,15 @@ class Quality(NamedTuple):
 def qualities(metrics: Mapping[str, Any], titles: Mapping[str, str]) -> list[Quality]:
     """Return the grade of every flow that has one, the flow without a device first; `titles` are of treatments."""
     graded, found = _graded(metrics), []
-    for name, title in ({BARE: "Without a device"} | dict(titles)).items():
+    for name, title in ({BARE: ""} | dict(titles)).items():
         if name in graded:
-            one = graded[name]
+            one, which = graded[name], f"Grid and convergence {f'with {title}' if title else 'without a device'}"
             spacing, inflow = (format_value(key, one[key]) for key in ("grid_spacing_mm", "inflow_mL_s"))
             computation = (
                 f"grid spacing {spacing}, {one['cells_count']:,} cells, {one['steps_count']:,} time steps, inflow "
                 f"{inflow} (Reynolds number {one['inlet_reynolds_number_count']:.0f})"
             )
-            found.append(Quality(name, title, one["grade"], "; ".join(one["reasons"]), computation))
+            found.append(Quality(name, which, one["grade"], "; ".join(one["reasons"]), computation))
     return found
 
 

@@ -73,6 +73,8 @@ def claimed(out: Path) -> Iterator[None]:
     try:
         sweep(out)
         yield
+        if os.fstat(lock.fileno()).st_nlink == 0:
+            raise FolderError(f"{out} was removed while this run wrote to it, and is not complete: run it again")
     finally:
         (cache / LOCK).unlink(missing_ok=True)
         lock.close()

@@ -24,7 +24,7 @@ from vstent.devices.design import Size
 from vstent.devices.ranges import how_sure
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.devices.treatment import BARE, Implant
-from vstent.errors import DeviceError, FlowError, InputError, LandingError, ReadError, VstentError
+from vstent.errors import DeviceError, FlowError, InputError, LandingError, ReadError, VesselError, VstentError
 from vstent.flow.background import BackgroundWork
 from vstent.flow.case import FlowField
 from vstent.flow.engines import Progress as FlowProgress
@@ -70,7 +70,7 @@ def find_anatomy(path: Path, settings: Settings, store: Store, keys: Keys) -> An
     anatomy = store.find(ANATOMY, keys[ANATOMY], Anatomy)
     if anatomy is not None:
         return anatomy
-    given = settings.anatomy
+    given, whole = settings.anatomy, None
     try:
         whole = find_vessel(path, settings, store, keys)
         neck_mm, outlet_mm = _array(given.neck_mm), _array(given.outlet_mm)
@@ -84,12 +84,24 @@ def find_anatomy(path: Path, settings: Settings, store: Store, keys: Keys) -> An
             anatomy = restore(traced, at_mm=_array(given.at_mm), outlet_mm=outlet_mm, neck_mm=neck_mm)
             tell(" ".join([*anatomy.notes, *(f"Sac volume {a.sac.volume_mm3:.0f} mm3." for a in anatomy.aneurysms)]))
     except InputError as error:
-        question = "" if given.at_mm is None or given.neck_mm is not None else other_reading(path, settings)
+        is_asked = given.at_mm is not None and given.neck_mm is None
+        is_near = whole is not None and is_asked and whole.lumen.closest(np.array([given.at_mm]))[1][0] < NEAR_MM
+        question = other_reading(path, settings) if is_asked and not is_near else ""
         if not question:
             raise
         raise type(error)(f"{error} {question}") from error
     store.defer(ANATOMY, keys[ANATOMY], anatomy)
     return anatomy
+
+
+def ask_for_aneurysm(anatomy: Anatomy, settings: Settings) -> None:
+    """Raise VesselError where there is no aneurysm, and a device would get a proposed place nevertheless."""
+    placed = [implant.placing.position_mm for treatment in settings.treatments for implant in treatment.implants]
+    if not anatomy.aneurysms and not settings.anatomy.without_aneurysm and None in placed:
+        raise VesselError(
+            "No aneurysm was found, so no size or place of a device is proposed. Give a point in it (--at), or deploy "
+            "without one: at a position along the artery (--center), or in its middle (--no-aneurysm)."
+        )
 
 
 def other_reading(path: Path, settings: Settings) -> str:
@@ -155,7 +167,9 @@ def deploy_all(
     """Return the implants of every treatment, stored or deployed, and the reasons why treatments do not fit, by name.
 
     DeviceError or LandingError is raised where no treatment can be deployed; the reason is that of the last one.
+    VesselError is raised where no aneurysm was found, and none is said to be missing.
     """
+    ask_for_aneurysm(anatomy, settings)
     deployed: dict[str, dict[str, Deployment]] = {}
     failures: dict[str, str] = {}
     for treatment in settings.treatments:
@@ -218,10 +232,17 @@ def size_of(implant: Implant, anatomy: Anatomy) -> Size:
 
 
 def check_inflow(anatomy: Anatomy, flow: FlowSettings | None) -> None:
-    """Raise InputError where no artery has the given mean inflow: it is probably in another unit."""
-    if flow is None or flow.inflow_mL_s is None:
+    """Raise InputError where no artery has the mean inflow: its unit or an inlet is wrong."""
+    if flow is None or (flow.inflow_mL_s is None and len(anatomy.vessel.inlets) == 1):
         return
     case = vessel_case(anatomy.vessel, flow)
+    outlets_mm2 = sum(outlet.area_mm2 for outlet in anatomy.vessel.outlets)
+    if len(anatomy.vessel.inlets) > 1 and case.inflow_mL_s > FASTEST_M_S * outlets_mm2:
+        raise InputError(
+            f"{case.inflow_mL_s:.1f} mL/s enter through {len(anatomy.vessel.inlets)} inlets and would leave through "
+            f"{outlets_mm2:.1f} mm2 at {case.inflow_mL_s / outlets_mm2:.1f} m/s: check whether each of them brings "
+            "blood (--inlet)"
+        )
     for inlet, part_mL_s, speed_m_s in zip(case.vessel.inlets, case.inlets_mL_s, case.inlet_speeds_m_s, strict=True):
         if not SLOWEST_M_S <= speed_m_s <= FASTEST_M_S:
             raise InputError(

@@ -52,6 +52,16 @@ def demo() -> tuple[Anatomy, phantoms.Phantom]:
     return anatomy_of(phantom), phantom
 
 
+def test_a_bulge_without_a_neck_is_refused(demo, monkeypatch: pytest.MonkeyPatch) -> None:
+    anatomy, _ = demo
+    (sac,) = anatomy.aneurysms
+    shut = replace(sac, neck=Surface(sac.neck.vertices_mm[:1] + 1e-6 * sac.neck.vertices_mm, sac.neck.faces))
+    monkeypatch.setattr("vstent.anatomy.restore.restore.cut_sac", lambda *_: shut)
+    monkeypatch.setattr("vstent.anatomy.restore.restore.plane_sac", lambda *_: None)
+    with pytest.raises(InputError, match="is too flat: no sac is left beyond its neck"):
+        restore(anatomy.vessel, at_mm=sac.sac.vertices_mm.mean(axis=0))
+
+
 def test_the_demo_artery_is_restored_under_sac_and_branch(demo) -> None:
     radius_error, distance_mm = relative_errors(*demo)
     assert np.abs(radius_error).mean() < 0.01

@@ -59,7 +59,7 @@ def told(
             f"{len(aneurysms)} sacs, the largest first: {listed}. Devices and flow refer to the first; choose another "
             "one by a point in it (--at)."
         )
-    notes += _before_another(vessel, path, bulges)
+    notes += _on_another(vessel, path, bulges, has_sac=bool(aneurysms))
     notes += _near_sacs(vessel, bulges)
     notes += _from_sacs(vessel, path, aneurysms)
     notes += _fusiform(line, sacs)
@@ -110,16 +110,25 @@ def _neck(aneurysm: Aneurysm) -> list[str]:
     return notes
 
 
-def _before_another(vessel: Vessel, path: int, bulges: list[Bulge]) -> list[str]:
-    """Return a note where the highest bulge is on the artery from another inlet, upstream of the parent artery."""
+def _on_another(vessel: Vessel, path: int, bulges: list[Bulge], *, has_sac: bool) -> list[str]:
+    """Return a note where the highest bulge is on the artery from another inlet, or without a sac to another outlet."""
     if not bulges or reach_of(vessel.centerlines[path], bulges[0]) <= PASSING:
         return []
-    return [
-        f"The bulge {bulges[0].height_mm:.1f} mm high at {place(bulges[0].dome_mm)} is on the artery from "
-        f"{end.role}, {end.described}: give that opening as the first inlet (--inlet)."
+    lies = f"The bulge {bulges[0].height_mm:.1f} mm high at {place(bulges[0].dome_mm)} is on the artery"
+    passing = [
+        end
         for end, line in zip(vessel.far_ends, vessel.centerlines, strict=True)
-        if end.is_inlet and reach_of(line, bulges[0]) <= PASSING
+        if reach_of(line, bulges[0]) <= PASSING
     ]
+    notes = [
+        f"{lies} from {end.role}, {end.described}: give that opening as the first inlet (--inlet)."
+        for end in passing
+        if end.is_inlet
+    ]
+    outlets = [end.role for end in passing if not end.is_inlet]
+    if outlets and not notes and not has_sac:
+        notes.append(f"{lies} to {outlets[0]}: choose that outlet (--outlet), or none.")
+    return notes
 
 
 def _fusiform(line: Centerline, bulges: list[Bulge]) -> list[str]:

@@ -38,6 +38,8 @@ OFF_PLANE: Final = 1 / 3
 NECK_SEEN: Final = 0.5
 """A neck beside a branch follows the arteries' wall if its projection has at least this fraction of the area of the
 section by the neck plane."""
+LEAST_MM2: Final = 0.1
+"""Area of the smallest neck, in mm2: that of a circle of 0.36 mm, the size of a voxel."""
 MOST_FLAT: Final = 3
 """Number of flat bulges that are examined at most: one on a branch takes as long as restoring the artery."""
 
@@ -89,6 +91,16 @@ def restore(
         sacs = [sac for sac, one in zip(sacs, candidates, strict=True) if one.is_aneurysm]
         candidates += others
     aneurysms = tuple(sorted(sacs, key=lambda sac: -sac.sac.volume_mm3))
+    if at_mm is not None and not aneurysms:
+        off_way = (
+            f"the artery to {vessel.far_ends[path].role} does not pass the bulge near {place(at_mm)}: leave out the "
+            "outlet (--outlet), or give another one"
+        )
+        flat_bulge = (
+            f"the bulge near {place(at_mm)} is too flat: no sac is left beyond its neck. Give a point in the dome of "
+            "another one, in LPS mm, or draw its neck (--neck)."
+        )
+        raise InputError(flat_bulge if outlet_mm is None else off_way)
     flat = None if aneurysms or at_mm is not None else _flat_sac(vessel, outlet_mm, path, landing)
     parent = Path(PARENT, landing.axis, landing.section_radius_mm, landing.surface, landing.is_restored.ravel())
     notes = told(vessel, path, bulges or found, aneurysms, candidates, flat, is_drawn=drawn is not None)
@@ -107,7 +119,8 @@ def _closed(
     for bulge in bulges:
         sac = _sac(vessel, path, landing, tubes, bulge)
         # Bulges that are separate above the tubes may be one sac above the landing surface, which is lower.
-        sacs += [] if sac is None or is_in_one(sac.sac.vertices_mm, sacs) else [sac]
+        if sac is not None and sac.neck.area_mm2 > LEAST_MM2 and not is_in_one(sac.sac.vertices_mm, sacs):
+            sacs.append(sac)
     return path, landing, sacs
 
 
