@@ -38,6 +38,9 @@ OF_USE: Final = "Research use only. Not cleared for diagnosis or treatment."
 AT_OUTLETS: Final = {
     "zero_pressure": "the pressure at the outlets is assumed, not measured in the patient",
     "murray": "the flow is split among the outlets by their diameter cubed, not measured in the patient",
+    "split": "the shares of the outlets in the flow are assumed, unless they were measured in the patient",
+    "resistance": "the resistance downstream of every outlet is assumed, from the mean arterial pressure and its share",
+    "windkessel": "the Windkessel downstream of every outlet is assumed, from the mean arterial pressure and its share",
 }
 """Limit that a report states, by the outlet setting of the flow."""
 SHOWN: Final = ("implants", "flow", "change", "quality", "uncertainty")
