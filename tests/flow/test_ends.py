@@ -12,6 +12,7 @@ from vstent.errors import InputError
 from vstent.flow.case import FlowCase, Sheet
 from vstent.flow.domain import section_pressure_Pa
 from vstent.flow.ends import MEAN_INLET_SPEED_M_S, End, FlowRate, Inflow, Pressure, Resistance, ends_of, outflows
+from vstent.flow.indices import balance, residuals
 from vstent.flow.problem import vessel_case
 from vstent.flow.settings import FlowSettings, Numerics
 from vstent.flow.simulation import simulate_case
@@ -76,6 +77,9 @@ def test_a_pressure_at_an_outlet_sends_the_blood_to_the_other() -> None:
     # A pressure common to all outlets shifts that of the vessel and moves no blood.
     np.testing.assert_allclose(level.outlets_mL_s, even.outlets_mL_s, rtol=2e-3)
     np.testing.assert_allclose(level.pressure_Pa - even.pressure_Pa, 30.0, rtol=0.01)
+    assert "outlet_2_asked_share_fraction" not in balance(vessel_case(fork(), SETTINGS), even)  # pressures alone
+    murray = balance(vessel_case(fork(), replace(SETTINGS, outlets="murray")), even)
+    assert murray["outlet_1_asked_share_fraction"] == pytest.approx(1 - murray["outlet_2_asked_share_fraction"])
     assert higher.outlets_mL_s[1] < 0.92 * level.outlets_mL_s[1]
     assert higher.inlet_pressure_Pa[0] > level.inlet_pressure_Pa[0] + 0.1
 
@@ -166,6 +170,8 @@ def test_settings_state_shares_and_resistances() -> None:
     assert by_square == FlowRate(pytest.approx(narrow.diameter_mm**2 / (wide.diameter_mm**2 + narrow.diameter_mm**2)))
     with pytest.raises(InputError, match=r"3 shares of the flow for 2 outlets: give one for each outlet"):
         ends_of(fork(), replace(shares, shares=(1.0, 1.0, 1.0)))
+    with pytest.raises(InputError, match="no effect with --outlets murray: choose split, resistance or windkessel"):
+        ends_of(fork(), replace(shares, outlets="murray"))
     assert vessel_case(fork(), shares).is_split_given
 
 
@@ -208,7 +214,14 @@ def test_a_covered_branch_loses_as_much_as_the_network_of_resistors_says() -> No
     assert drop_Pa[1] - drop_Pa[0] > 300
     lost_mL_s = (drop_Pa[1] - drop_Pa[0]) / (first.at(0.0) + second.at(0.0))
     assert bare.outlets_mL_s[1] - after.outlets_mL_s[1] == pytest.approx(lost_mL_s, rel=0.02)
-    assert 0.005 < lost_mL_s < 0.02
+    asked = balance(case.resisted_as(bare), after)
+    assert asked["outlet_2_asked_share_fraction"] == pytest.approx(share - lost_mL_s / INFLOW_ML_S, rel=1e-3)
+    assert asked["outlet_2_share_fraction"] == pytest.approx(after.outlets_mL_s[1] / after.outlets_mL_s.sum())
+    assert asked["common_pressure_Pa"] == pytest.approx(after.common_pressure_Pa)
+    missing = residuals(case.resisted_as(bare), after)
+    assert set(missing) == {f"{name}_residual_fraction" for name in ("mass", "inlet", "outlet_1", "outlet_2")}
+    assert max(map(abs, missing.values())) < 3e-3
+    assert 0.003 < lost_mL_s < 0.02
     assert after.outlets_mL_s.sum() == pytest.approx(INFLOW_ML_S, rel=3e-3)
 
 

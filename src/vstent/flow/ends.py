@@ -95,6 +95,11 @@ def ends_of(vessel: Vessel, settings: FlowSettings) -> tuple[End, ...]:
     if settings.inflow_mL_s is not None:
         inflow_mL_s = settings.inflow_mL_s * murray_shares(inlets)
     entering = map(Inflow, inflow_mL_s.tolist())
+    if settings.shares is not None and settings.outlets in ("zero_pressure", "murray"):
+        raise InputError(
+            f"shares of the outlets have no effect with --outlets {settings.outlets}: choose split, resistance or "
+            "windkessel"
+        )
     if settings.outlets == "zero_pressure":
         return (*entering, *(Pressure() for _ in outlets))
     shares = murray_shares(outlets) if settings.outlets == "murray" else _shares(outlets, settings)
