@@ -95,6 +95,11 @@ class FlowCase:
         return np.array([end.mean_mL_s for end in self.ends if isinstance(end, Inflow)])
 
     @property
+    def inflow_source(self) -> str:
+        """Where the inflow comes from, for a user; empty where it was given."""
+        return next(end.source for end in self.ends if isinstance(end, Inflow))
+
+    @property
     def inlet_speeds_m_s(self) -> Floats:
         """Mean speed (i,) in each inlet."""
         return self.inlets_mL_s / np.array([inlet.area_mm2 for inlet in self.vessel.inlets])

@@ -14,7 +14,9 @@ from vstent.kernels.arrays import Floats
 from vstent.units import PA_PER_MMHG, counted
 
 MEAN_INLET_SPEED_M_S: Final = 0.27
-"""Default mean speed in an inlet, m/s, for an internal carotid artery."""
+"""Default mean speed in an inlet, m/s, for an internal carotid artery: that of VaMPy. Its companion VaSP has 0.31."""
+ASSUMED: Final = f"assumed: {MEAN_INLET_SPEED_M_S} m/s, the default of VaMPy"
+"""Where an inflow comes from that is not given."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,8 @@ class Inflow:
 
     mean_mL_s: float
     """Mean flow rate in."""
+    source: str = ""
+    """Where it comes from, for a user; empty: it was given."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +98,8 @@ def ends_of(vessel: Vessel, settings: FlowSettings) -> tuple[End, ...]:
     inflow_mL_s = MEAN_INLET_SPEED_M_S * np.array([inlet.area_mm2 for inlet in inlets])
     if settings.inflow_mL_s is not None:
         inflow_mL_s = settings.inflow_mL_s * murray_shares(inlets)
-    entering = map(Inflow, inflow_mL_s.tolist())
+    source = ASSUMED if settings.inflow_mL_s is None else ""
+    entering = [Inflow(mean_mL_s, source) for mean_mL_s in inflow_mL_s.tolist()]
     if settings.shares is not None and settings.outlets in ("zero_pressure", "murray"):
         raise InputError(
             f"shares of the outlets have no effect with --outlets {settings.outlets}: choose split, resistance or "

@@ -72,7 +72,7 @@ class Grade:
     """The measures that it rests on."""
 
 
-def computation_of(case: FlowCase, field: FlowField) -> dict[str, float]:
+def computation_of(case: FlowCase, field: FlowField) -> dict[str, float | str]:
     """Return what was computed: grid spacing, cells, steps, inflow, Reynolds number of the inlet, and residuals."""
     inlet = case.vessel.inlet
     speed_m_s = float(field.inlets_mL_s[0]) * 1e-6 / (inlet.area_mm2 * M_PER_MM**2)
@@ -84,6 +84,7 @@ def computation_of(case: FlowCase, field: FlowField) -> dict[str, float]:
         "inflow_mL_s": field.inflow_mL_s,
         "inlet_reynolds_number_count": speed_m_s * inlet.diameter_mm * M_PER_MM / viscosity_m2_s,
         **residuals(case, field),
+        **({"inflow_source": case.inflow_source} if case.inflow_source else {}),
     }
 
 

@@ -142,7 +142,7 @@ class FlowSettings:
         "flow-rate",
         "mean inflow of all inlets",
         limits=Limits("mL/s", above=0.0, high=50.0, remark="240 mL/min are 4 mL/s"),
-        usual="0.27 m/s times their area",
+        usual="assumed: 0.27 m/s times their area, as in VaMPy",
     )
     """Mean flow rate through all inlets together; None: 0.27 m/s times the area of each inlet."""
     blood: Blood = Blood()

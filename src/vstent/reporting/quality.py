@@ -47,9 +47,10 @@ def qualities(metrics: Mapping[str, Any], titles: Mapping[str, str]) -> list[Qua
         if name in graded:
             one = graded[name]
             spacing, inflow = (format_value(key, one[key]) for key in ("grid_spacing_mm", "inflow_mL_s"))
+            source = f", {one['inflow_source']}" if "inflow_source" in one else ""
             computation = (
                 f"grid spacing {spacing}, {one['cells_count']:,} cells, {one['steps_count']:,} time steps, inflow "
-                f"{inflow} (Reynolds number {one['inlet_reynolds_number_count']:.0f}), mass residual "
+                f"{inflow}{source} (Reynolds number {one['inlet_reynolds_number_count']:.0f}), mass residual "
                 f"{100 * abs(one['mass_residual_fraction']):.2f} %"
             )
             found.append(Quality(name, title, one["grade"], "; ".join(one["reasons"]), computation))
