@@ -9,6 +9,8 @@ MM_PER_UM: Final = 1e-3
 """Millimeters in a micrometer."""
 M3_PER_ML: Final = 1e-6
 """Cubic meters in a milliliter."""
+PA_PER_MMHG: Final = 133.322
+"""Pascals in a millimeter of mercury."""
 BYTES_PER_MB: Final = 1e6
 """Bytes in a megabyte."""
 MM_PER: Final = {"m": 1e3, "cm": 10.0, "mm": 1.0}

@@ -24,6 +24,8 @@ def graded(**grades: str) -> dict:
         "steps_count": 4000,
         "inflow_mL_s": 3.74,
         "inlet_reynolds_number_count": 297.4,
+        "mass_residual_fraction": 0.0004,
+        "inflow_source": "assumed: 0.27 m/s",
     }
     metrics = report_case.metrics()
     for name, grade in grades.items():
@@ -71,7 +73,8 @@ def test_grade_and_grid_stand_below_the_first_numbers_of_the_report_and_say_what
     assert "~ Grid and convergence with Silk" in before
     assert "fair (9 cells across the neck)" in before
     assert "not usable (9 cells across the neck)" in before
-    assert "grid spacing 0.400 mm, 19,152 cells, 4,000 time steps, inflow 3.74 mL/s (Reynolds number 297)" in before
+    assert "grid spacing 0.400 mm, 19,152 cells, 4,000 time steps, inflow 3.74 mL/s, assumed: 0.27 m/s" in before
+    assert "(Reynolds number 297), mass residual 0.04 %" in before
 
 
 def test_a_case_without_grades_has_none() -> None:

@@ -146,13 +146,18 @@ def test_of_a_pulse_it_is_said_which_numbers_are_means(page):
     [
         (
             FlowSettings(),
-            ("Blood is Newtonian", "pressure at the outlets is assumed", "porous screen"),
+            (
+                "Blood is Newtonian",
+                "pressure at the outlets is assumed",
+                "porous screen",
+                "inflow is assumed: 0.27 m/s",
+            ),
             ("shear-thinning", "cubed"),
         ),
         (
-            FlowSettings(blood=Blood(thinning=CarreauYasuda()), outlets="murray", numerics=Numerics(engine="openfoam")),
+            FlowSettings(4.0, Blood(thinning=CarreauYasuda()), None, "murray", numerics=Numerics(engine="openfoam")),
             ("Blood is shear-thinning", "by their diameter cubed", "meshed wires over the neck"),
-            ("Newtonian", "pressure at the outlets", "porous screen"),
+            ("Newtonian", "pressure at the outlets", "porous screen", "inflow is assumed"),
         ),
         (FlowSettings(numerics=Numerics(engine="my_engine")), ("Blood is Newtonian",), ("a device is",)),
         (None, (), ("Blood", "outlets", "a device is")),

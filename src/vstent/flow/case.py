@@ -8,7 +8,7 @@ import numpy as np
 
 from vstent.deployment.struts import struts
 from vstent.devices.stent import Stent
-from vstent.flow.ends import End, FlowRate, Inflow
+from vstent.flow.ends import End, FlowRate, Inflow, Resistance
 from vstent.flow.settings import Blood, Numerics
 from vstent.flow.waveform import Waveform
 from vstent.geometry.surface import Surface
@@ -106,6 +106,11 @@ class FlowCase:
         return np.array([end.mean_mL_s for end in self.ends if isinstance(end, Inflow)])
 
     @property
+    def inflow_source(self) -> str:
+        """Where the inflow comes from, for a user; empty where it was given."""
+        return next(end.source for end in self.ends if isinstance(end, Inflow))
+
+    @property
     def inlet_speeds_m_s(self) -> Floats:
         """Mean speed (i,) in each inlet."""
         return self.inlets_mL_s / np.array([inlet.area_mm2 for inlet in self.vessel.inlets])
@@ -116,12 +121,26 @@ class FlowCase:
         return float(self.inlets_mL_s.sum())
 
     @property
-    def is_split_given(self) -> bool:
-        """Whether the flow of every opening is given: all but one have a flow rate, so that resistances do not matter.
+    def resistances(self) -> tuple[Resistance, ...]:
+        """Resistances at the outlets, in their order; empty where these have other conditions."""
+        return tuple(end for end in self.ends if isinstance(end, Resistance))
 
-        With a single outlet it always is.
+    @property
+    def is_split_given(self) -> bool:
+        """Whether the resistance of a branch hardly matters for its flow.
+
+        The flow rate of all openings but one is given or follows from a resistance downstream, which is far larger. A
+        single outlet always takes all.
         """
-        return sum(not isinstance(end, Inflow | FlowRate) for end in self.ends) < 2
+        return sum(not isinstance(end, Inflow | FlowRate | Resistance) for end in self.ends) < 2
+
+    def resisted_as(self, bare: "FlowField") -> "FlowCase":
+        """Return the case with the resistances that follow from the flow without a device."""
+        if not self.resistances:
+            return self
+        at_outlets = zip(self.resistances, np.nan_to_num(bare.outlet_pressure_Pa).tolist(), strict=True)
+        known = (replace(end, resistance_Pa_s_mL=end.at(pressure_Pa)) for end, pressure_Pa in at_outlets)
+        return replace(self, ends=(*self.ends[: len(self.vessel.inlets)], *known))
 
     @property
     def pulse(self) -> Waveform:
@@ -288,6 +307,8 @@ class FlowField:
     mean_shear_Pa: Floats | None = None
     """(v,) time-averaged magnitude of the wall shear stress of an unsteady flow at constant inflow, which the mean
     vectors do not contain because oscillations cancel; None for any other flow."""
+    common_pressure_Pa: float = 0.0
+    """Mean pressure that resistances at the outlets add to all pressures of this field; 0 without them."""
     neck_inflow_mL_s: float | None = None
     """Neck inflow where it cannot be computed from this field: the time average of an unsteady flow, or the value
     from an OpenFOAM mesh that is finer around the wires than this grid (0 where there is no neck). None: it is

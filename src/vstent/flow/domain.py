@@ -112,7 +112,7 @@ def too_narrow(case: FlowCase, cell_size_mm: float) -> str:
     return (
         f" Under-resolved branches: at a grid spacing of {cell_size_mm:.3g} mm, {named} cells across. With fewer than "
         f"{BRANCH_CELLS:.0f} a branch has too much resistance and carries too little flow: use a finer grid spacing, "
-        "or split the outflow by Murray's law."
+        "or give the outlets resistances or fixed shares."
     )
 
 
@@ -143,7 +143,7 @@ def cells_of_sac(case: FlowCase, grid: Domain) -> Ints:
     return cells
 
 
-def section_pressure_Pa(vessel: Vessel, grid: Domain, pressure_Pa: Floats) -> Floats:
+def section_pressure_Pa(vessel: Vessel, grid: Cells, pressure_Pa: Floats) -> Floats:
     """Return the mean pressure (k,) over the section of every opening, nan where no cell is near it.
 
     The section is that of the opening, not the end of its extension.

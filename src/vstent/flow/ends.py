@@ -1,15 +1,22 @@
 """Boundary conditions at the openings of a vessel, and what the settings' word for the outlets means."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
+from vstent.errors import InputError
 from vstent.flow.settings import FlowSettings
-from vstent.geometry.vessel import Vessel, murray_shares
+from vstent.geometry.vessel import Opening, Vessel, murray_shares
+from vstent.kernels.arrays import Floats
+from vstent.units import PA_PER_MMHG, counted
 
 MEAN_INLET_SPEED_M_S: Final = 0.27
-"""Default mean speed in an inlet, m/s, for an internal carotid artery."""
+"""Default mean speed in an inlet, m/s, for an internal carotid artery: that of VaMPy. Its companion VaSP has 0.31."""
+ASSUMED: Final = f"assumed: {MEAN_INLET_SPEED_M_S} m/s, the default of VaMPy"
+"""Where an inflow comes from that is not given."""
 
 
 @dataclass(frozen=True)
@@ -21,6 +28,8 @@ class Inflow:
 
     mean_mL_s: float
     """Mean flow rate in."""
+    source: str = ""
+    """Where it comes from, for a user; empty: it was given."""
 
 
 @dataclass(frozen=True)
@@ -39,22 +48,104 @@ class Pressure:
     """The pressure."""
 
 
-End: TypeAlias = Inflow | FlowRate | Pressure
+@dataclass(frozen=True)
+class Resistance:
+    """A resistance downstream of an outlet, or a Windkessel: the flow rate out follows the pressure.
+
+    The mean flow rate is (P + p) / R. Here p is the pressure at this outlet in the computed flow, and P is a pressure
+    common to all outlets, with which as much leaves as enters (see `outflows`). Only p exists in the computed flow.
+
+    In a pulsatile flow the blood passes a part of R, the compliance C and the rest of R: the three-element Windkessel.
+    Without a compliance all of R acts at once.
+
+    References
+    ----------
+    Westerhof, Lankhaar and Westerhof 2009, Med. Biol. Eng. Comput. 47, 131.
+    """
+
+    mean_mL_s: float
+    """Mean flow rate out without a device."""
+    pressure_Pa: float
+    """Mean of the common pressure without a device."""
+    compliance_time_s: float = 0.0
+    """R C; 0: a plain resistance."""
+    proximal_fraction: float = 1.0
+    """Part of R before the compliance."""
+    resistance_Pa_s_mL: float | None = None
+    """R; None in the flow without a device, whose mean flow rate is `mean_mL_s` with the R that results."""
+
+    def at(self, pressure_Pa: float) -> float:
+        """Return R, Pa s/mL; where it is not known, that with which the flow at a mean pressure p is `mean_mL_s`."""
+        return self.resistance_Pa_s_mL or (self.pressure_Pa + pressure_Pa) / self.mean_mL_s
+
+    def relative_impedance(self, rate_per_s: Floats) -> NDArray[np.complex128]:
+        """Return the complex impedance (n,) at angular frequencies (n,), divided by R."""
+        distal = 1 - self.proximal_fraction
+        return np.asarray(self.proximal_fraction + distal / (1 + 1j * rate_per_s * distal * self.compliance_time_s))
+
+
+End: TypeAlias = Inflow | FlowRate | Pressure | Resistance
 """Boundary condition at one opening. Every engine decides by its type in one place."""
 
 
 def ends_of(vessel: Vessel, settings: FlowSettings) -> tuple[End, ...]:
     """Return the boundary condition at every opening of a vessel, in their order.
 
-    The inflow is shared among several inlets by Murray's law, or enters each with the default mean speed. With Murray's
-    law at the outlets too, all but the widest get a flow rate, and the widest has zero pressure and takes the rest.
+    The inflow is shared among several inlets by Murray's law, or enters each with the default mean speed. Where the
+    outlets have fixed shares, all but the widest get a flow rate, and the widest has zero pressure and takes the rest.
     """
     inlets, outlets = vessel.inlets, vessel.outlets
     inflow_mL_s = MEAN_INLET_SPEED_M_S * np.array([inlet.area_mm2 for inlet in inlets])
     if settings.inflow_mL_s is not None:
         inflow_mL_s = settings.inflow_mL_s * murray_shares(inlets)
-    entering = map(Inflow, inflow_mL_s.tolist())
+    source = ASSUMED if settings.inflow_mL_s is None else ""
+    entering = [Inflow(mean_mL_s, source) for mean_mL_s in inflow_mL_s.tolist()]
+    if settings.shares is not None and settings.outlets in ("zero_pressure", "murray"):
+        raise InputError(
+            f"shares of the outlets have no effect with --outlets {settings.outlets}: choose split, resistance or "
+            "windkessel"
+        )
     if settings.outlets == "zero_pressure":
         return (*entering, *(Pressure() for _ in outlets))
-    outflow_mL_s = inflow_mL_s.sum() * murray_shares(outlets)
-    return (*entering, Pressure(), *map(FlowRate, outflow_mL_s[1:].tolist()))
+    shares = murray_shares(outlets) if settings.outlets == "murray" else _shares(outlets, settings)
+    outflow_mL_s = (inflow_mL_s.sum() * shares).tolist()
+    if settings.outlets in ("murray", "split"):
+        return (*entering, Pressure(), *map(FlowRate, outflow_mL_s[1:]))
+    pressure_Pa = PA_PER_MMHG * settings.mean_pressure_mmHg
+    compliant = settings.compliance_time_s, settings.proximal_fraction
+    stored = compliant if settings.outlets == "windkessel" else ()
+    return (*entering, *(Resistance(mean_mL_s, pressure_Pa, *stored) for mean_mL_s in outflow_mL_s))
+
+
+def _shares(outlets: Sequence[Opening], settings: FlowSettings) -> Floats:
+    """Return the share (k,) of every outlet: as given, or by diameter."""
+    parts = np.array([outlet.diameter_mm for outlet in outlets]) ** settings.outlet_exponent
+    if settings.shares is not None:
+        if len(settings.shares) != len(outlets):
+            raise InputError(
+                f"{counted(len(settings.shares), 'share')} of the flow for {counted(len(outlets), 'outlet')}: give one "
+                "for each outlet, the widest first (--outlet-shares)"
+            )
+        parts = np.array(settings.shares)
+    return np.asarray(parts / parts.sum())
+
+
+def outflows(
+    ends: Sequence[Resistance], inflow_mL_s: Floats, pressure_Pa: Floats, period_s: float = np.inf
+) -> tuple[Floats, Floats]:
+    """Return the flow rates (m, k) out through resistances, and the pressure (m,) common to their outlets.
+
+    All values belong to m equally spaced times of a cycle in its periodic state; a single one is the mean. Inflow (m,)
+    and the pressures (m, k) at the outlets are given. For every harmonic the flow rate is (P + p) / Z with the
+    impedance Z of an outlet, and P follows from the sum of the flow rates.
+    """
+    spectrum = np.fft.rfft(pressure_Pa, axis=0)
+    rate_per_s = np.asarray(2 * np.pi / period_s * np.arange(len(spectrum)), dtype=np.float64)
+    means_Pa = pressure_Pa.mean(axis=0).tolist()
+    impedances = [end.at(p) * end.relative_impedance(rate_per_s) for end, p in zip(ends, means_Pa, strict=True)]
+    admittance = 1 / np.stack(impedances, axis=1)
+    common = np.fft.rfft(inflow_mL_s) - (admittance * spectrum).sum(axis=1)
+    common /= admittance.sum(axis=1)
+    count = len(pressure_Pa)
+    flows_mL_s = np.fft.irfft(admittance * (common[:, None] + spectrum), count, axis=0)
+    return flows_mL_s, np.fft.irfft(common, count)

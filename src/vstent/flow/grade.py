@@ -9,7 +9,7 @@ import numpy as np
 
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.domain import mean_diameter_mm
-from vstent.flow.indices import neck_diameter_mm, parent_diameter_mm
+from vstent.flow.indices import neck_diameter_mm, parent_diameter_mm, residuals
 from vstent.flow.lattice.setup import CELL_REYNOLDS
 from vstent.flow.settings import LATTICE
 from vstent.geometry.surface import Surface
@@ -72,8 +72,8 @@ class Grade:
     """The measures that it rests on."""
 
 
-def computation_of(case: FlowCase, field: FlowField) -> dict[str, float]:
-    """Return what was computed: grid spacing, cells, steps, inflow, and the Reynolds number of the widest inlet."""
+def computation_of(case: FlowCase, field: FlowField) -> dict[str, float | str]:
+    """Return what was computed: grid spacing, cells, steps, inflow, Reynolds number of the inlet, and residuals."""
     inlet = case.vessel.inlet
     speed_m_s = float(field.inlets_mL_s[0]) * 1e-6 / (inlet.area_mm2 * M_PER_MM**2)
     viscosity_m2_s = field.blood.kinematic_viscosity_m2_s
@@ -83,6 +83,8 @@ def computation_of(case: FlowCase, field: FlowField) -> dict[str, float]:
         "steps_count": field.steps,
         "inflow_mL_s": field.inflow_mL_s,
         "inlet_reynolds_number_count": speed_m_s * inlet.diameter_mm * M_PER_MM / viscosity_m2_s,
+        **residuals(case, field),
+        **({"inflow_source": case.inflow_source} if case.inflow_source else {}),
     }
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from vstent.flow import sampling
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.domain import mean_diameter_mm
+from vstent.flow.ends import FlowRate, outflows
 from vstent.flow.ostium import sac_surfaces
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy, roles
@@ -93,6 +94,46 @@ def indices(
     result["turnover_time_s"] = abs(sac.volume_mm3) * 1e-3 / max(inflow_mL_s, 1e-12)
     result["inflow_concentration_index"] = inflow_mL_s / field.inflow_mL_s / max(share, 1e-12)
     return result | _of_sac_wall(field, sac, ostium)
+
+
+def balance(case: FlowCase, field: FlowField) -> dict[str, float]:
+    """Return shares, asked and reached, and mean pressures of several outlets, and the pressure that they share."""
+    result = {"common_pressure_Pa": field.common_pressure_Pa} if case.resistances else {}
+    if len(field.outlets_mL_s) < 2:
+        return result
+    asked = _asked_outflow_mL_s(case, field) / case.inflow_mL_s
+    reached = field.outlets_mL_s / field.outlets_mL_s.sum()
+    for k, role in enumerate(roles(len(field.inlets_mL_s), len(asked))[-len(asked) :]):
+        of_outlet = {"share_fraction": reached[k], "asked_share_fraction": asked[k]}
+        of_outlet["pressure_Pa"] = field.outlet_pressure_Pa[k]
+        result |= {f"{role}_{name}": float(value) for name, value in of_outlet.items() if np.isfinite(value)}
+    return result
+
+
+def residuals(case: FlowCase, field: FlowField) -> dict[str, float]:
+    """Return what is missing of the flow rates of all openings together, and of each where one is asked, as fractions.
+
+    All are relative to the inflow.
+    """
+    through_mL_s = np.concatenate([field.inlets_mL_s, field.outlets_mL_s])
+    asked_mL_s = np.concatenate([case.inlets_mL_s, _asked_outflow_mL_s(case, field)])
+    missing = (asked_mL_s - through_mL_s) / case.inflow_mL_s
+    openings = roles(len(field.inlets_mL_s), len(field.outlets_mL_s))
+    named = {f"{role}_residual_fraction": float(one) for role, one in zip(openings, missing, strict=True)}
+    mass = float((field.inlets_mL_s.sum() - field.outlets_mL_s.sum()) / case.inflow_mL_s)
+    return {name: one for name, one in ({"mass_residual_fraction": mass} | named).items() if np.isfinite(one)}
+
+
+def _asked_outflow_mL_s(case: FlowCase, field: FlowField) -> Floats:
+    """Return the flow rate (k,) that the condition at every outlet asks for, nan where it only sets the pressure."""
+    if case.resistances:
+        outlets_Pa = np.nan_to_num(field.outlet_pressure_Pa)
+        return outflows(case.resistances, np.array([case.inflow_mL_s]), outlets_Pa[None])[0][0]
+    ends = case.ends[len(case.vessel.inlets) :]
+    asked_mL_s = np.array([end.mean_mL_s if isinstance(end, FlowRate) else np.nan for end in ends])
+    if case.is_split_given:
+        asked_mL_s[np.isnan(asked_mL_s)] = case.inflow_mL_s - np.nansum(asked_mL_s)
+    return asked_mL_s
 
 
 def ratios(before: dict[str, float], after: dict[str, float]) -> dict[str, float]:

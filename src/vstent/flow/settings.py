@@ -6,14 +6,16 @@ This module imports no numpy, so that command-line options and settings of a stu
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
-from vstent.fields import Limits, flag, setting, whole
+from vstent.fields import Limits, flag, numbers, setting, whole
 from vstent.flow.waveform import PUBLISHED, Waveform, read_waveform
 
 if TYPE_CHECKING:
     from vstent.kernels.arrays import Floats
 
-Outlets = Literal["zero_pressure", "murray"]
+Outlets = Literal["zero_pressure", "murray", "split", "resistance", "windkessel"]
 """Condition at the outlets."""
+RESISTING: Final = ("resistance", "windkessel")
+"""Conditions with which the flow out follows the pressure."""
 LATTICE: Final = "lattice_boltzmann"
 """Name of the embedded lattice-Boltzmann engine."""
 OPENFOAM: Final = "openfoam"
@@ -145,7 +147,7 @@ class FlowSettings:
         "flow-rate",
         "mean inflow of all inlets",
         limits=Limits("mL/s", above=0.0, high=50.0, remark="240 mL/min are 4 mL/s"),
-        usual="0.27 m/s times their area",
+        usual="assumed: 0.27 m/s times their area, as in VaMPy",
     )
     """Mean flow rate through all inlets together; None: 0.27 m/s times the area of each inlet."""
     blood: Blood = Blood()
@@ -164,8 +166,54 @@ class FlowSettings:
     )
     """Inflow waveform; None: steady inflow at the mean."""
     outlets: Outlets = setting(
-        "zero_pressure", "outlets", "zero pressure, or Murray's law: by diameter cubed", str, choices=get_args(Outlets)
+        "zero_pressure",
+        "outlets",
+        "zero pressure; fixed shares of the flow, by Murray's law (diameter cubed) or as given (split); or a "
+        "resistance or Windkessel at each outlet, so that a covered branch loses flow",
+        str,
+        choices=get_args(Outlets),
     )
-    """Zero pressure at every outlet, or outflow in proportion to radius cubed (Murray 1926, PNAS 12, 207)."""
+    """Zero pressure at every outlet; outflow in proportion to radius cubed (Murray 1926, PNAS 12, 207); outflow in
+    shares (`shares`); or a `Resistance` at every outlet with which these are the shares without a device."""
+    shares: tuple[float, ...] | None = setting(
+        None,
+        "outlet-shares",
+        "shares of the flow of all outlets in their order, such as 3,2,1 (any unit)",
+        numbers,
+        Limits(above=0.0, high=1e6),
+        usual="by diameter, see --outlet-exponent",
+        metavar="S,S,...",
+    )
+    """Shares of the flow of all outlets, with ``split``, ``resistance`` and ``windkessel``; None: by diameter."""
+    outlet_exponent: float = setting(
+        3.0,
+        "outlet-exponent",
+        "power of the diameter to which the share of an outlet is proportional",
+        limits=Limits(low=1.0, high=4.0),
+    )
+    """Power of the diameter to which the share of an outlet is proportional, where no shares are given."""
+    mean_pressure_mmHg: float = setting(
+        93.0,
+        "mean-pressure",
+        "mean arterial pressure, from which the resistances of the outlets follow",
+        limits=Limits("mmHg", 20.0, 200.0),
+    )
+    """Mean pressure at the outlets without a device, with resistances and Windkessels."""
+    compliance_time_s: float = setting(
+        0.69,
+        "windkessel-time",
+        "resistance times compliance of the Windkessel at every outlet",
+        limits=Limits("s", 0.05, 5.0),
+    )
+    """Resistance times compliance of every Windkessel: 0.69-0.70 s at all terminal arteries of the circle of Willis in
+    Alastruey et al. 2007, J. Biomech. 40, 1794."""
+    proximal_fraction: float = setting(
+        0.44,
+        "windkessel-proximal",
+        "share of the resistance of a Windkessel that lies before its compliance",
+        limits=Limits(low=0.01, high=0.99),
+    )
+    """Part of the resistance of a Windkessel before its compliance: 0.44 is the characteristic impedance over the
+    terminal resistance of all cerebral arteries there."""
     numerics: Numerics = Numerics()
     """How it is computed."""

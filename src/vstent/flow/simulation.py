@@ -22,7 +22,7 @@ from vstent.flow.engines import AbstractEngine, DivergenceError, Progress, Saved
 from vstent.flow.lattice.close_up import SHARE_AROUND, WIDTH, require_sac
 from vstent.flow.lattice.gpu import require_gpu
 from vstent.flow.problem import flow_case
-from vstent.flow.settings import LATTICE, OPENFOAM, FlowSettings, Numerics
+from vstent.flow.settings import LATTICE, OPENFOAM, RESISTING, FlowSettings, Numerics
 from vstent.geometry.vessel import Anatomy
 
 COARSE_SHARE = 0.12
@@ -110,10 +110,24 @@ def simulate_case(
     It starts from that in the same vessel without a stent, or from one with a similar stent, if that is steady in a
     refined sac too; no first guess is then computed. An engine that works with files resumes from those in its folder;
     without one they are deleted. `progress` is called at every check; an exception that it raises ends the run. From
-    a checkpoint the same flow resumes with an identical result to the last bit.
+    a checkpoint the same flow resumes with an identical result to the last bit. Resistances at the outlets that are
+    not known follow from the flow without a stent, which must then be given.
     """
+    if case.media or case.solids:
+        case = _resisted(case, start)
     with nullcontext(folder) if folder is not None else TemporaryDirectory(prefix="vstent-") as own:
         return _Runs(_engine_of(case), Path(own), progress, checkpoint, similar).answer(case, start)
+
+
+def _resisted(case: FlowCase, bare: FlowField | None) -> FlowCase:
+    """Return a case with resistances that follow from the flow without a device; InputError where that is missing."""
+    if all(end.resistance_Pa_s_mL is not None for end in case.resistances):
+        return case
+    if bare is None:
+        raise InputError(
+            "the resistances at the outlets follow from the flow without a device: compute that first and start from it"
+        )
+    return case.resisted_as(bare)
 
 
 def foretell_cost(case: FlowCase) -> str:
@@ -163,7 +177,12 @@ def check_engine(flow: FlowSettings | None, *, runs_here: bool = True) -> None:
     from vstent.flow.openfoam import program
 
     if flow is not None:
-        engine_class(flow.numerics, is_pulsatile=flow.waveform is not None)
+        engine = engine_class(flow.numerics, is_pulsatile=flow.waveform is not None)
+        if flow.outlets in RESISTING and not engine.has_resistances:
+            raise InputError(
+                f"the engine {flow.numerics.engine} does not support --outlets {flow.outlets}: give fixed shares "
+                f"(--outlets split or murray), or choose the engine {LATTICE}"
+            )
         if flow.numerics.engine == OPENFOAM and runs_here:
             program.find()
         if flow.numerics.device_gpu:

@@ -14,6 +14,7 @@ from numba import config
 
 from vstent.devices.stent import Deployment
 from vstent.devices.treatment import BARE
+from vstent.flow.ends import ASSUMED
 from vstent.flow.settings import LATTICE, OPENFOAM
 from vstent.reporting.definitions import DEFINITIONS, HEADLINES, OF_PULSE, Definition
 from vstent.reporting.drawing import Drawing
@@ -38,6 +39,9 @@ OF_USE: Final = "Research use only. Not cleared for diagnosis or treatment."
 AT_OUTLETS: Final = {
     "zero_pressure": "the pressure at the outlets is assumed, not measured in the patient",
     "murray": "the flow is split among the outlets by their diameter cubed, not measured in the patient",
+    "split": "the shares of the outlets in the flow are assumed, unless they were measured in the patient",
+    "resistance": "the resistance downstream of every outlet is assumed, from the mean arterial pressure and its share",
+    "windkessel": "the Windkessel downstream of every outlet is assumed, from the mean arterial pressure and its share",
 }
 """Limit that a report states, by the outlet setting of the flow."""
 SHOWN: Final = ("implants", "flow", "change", "quality", "uncertainty")
@@ -184,6 +188,8 @@ def limits_of(case: "CaseResult") -> tuple[str, ...]:
     limits = [OF_CONTOUR, f"{blood}, and the wall is rigid; {AT_OUTLETS[flow['outlets']]}."]
     if flow["numerics"]["engine"] in OF_DEVICE:
         limits.append(OF_DEVICE[flow["numerics"]["engine"]])
+    if flow["inflow_mL_s"] is None:
+        limits.append(f"The inflow is {ASSUMED}, times the area of every inlet. It was not measured in the patient.")
     if len(case.anatomy.vessel.inlets) > 1:
         limits.append(AT_INLETS)
     return *limits, OF_USE

@@ -27,7 +27,7 @@ class Quality(NamedTuple):
     reasons: str
     """What keeps it from being good; empty for a good flow."""
     computation: str
-    """Grid spacing, cells, steps, inflow and Reynolds number."""
+    """Grid spacing, cells, steps, inflow, Reynolds number and residual of mass."""
 
     @property
     def mark(self) -> str:
@@ -47,9 +47,11 @@ def qualities(metrics: Mapping[str, Any], titles: Mapping[str, str]) -> list[Qua
         if name in graded:
             one, which = graded[name], f"Grid and convergence {f'with {title}' if title else 'without a device'}"
             spacing, inflow = (format_value(key, one[key]) for key in ("grid_spacing_mm", "inflow_mL_s"))
+            source = f", {one['inflow_source']}" if "inflow_source" in one else ""
             computation = (
                 f"grid spacing {spacing}, {one['cells_count']:,} cells, {one['steps_count']:,} time steps, inflow "
-                f"{inflow} (Reynolds number {one['inlet_reynolds_number_count']:.0f})"
+                f"{inflow}{source} (Reynolds number {one['inlet_reynolds_number_count']:.0f}), mass residual "
+                f"{100 * abs(one['mass_residual_fraction']):.2f} %"
             )
             found.append(Quality(name, which, one["grade"], "; ".join(one["reasons"]), computation))
     return found

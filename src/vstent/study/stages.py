@@ -29,7 +29,7 @@ from vstent.flow.background import BackgroundWork
 from vstent.flow.case import FlowField
 from vstent.flow.engines import Progress as FlowProgress
 from vstent.flow.grade import computation_of, grade
-from vstent.flow.indices import indices, ratios
+from vstent.flow.indices import balance, indices, ratios
 from vstent.flow.ostium import sac_surfaces
 from vstent.flow.problem import flow_case, vessel_case
 from vstent.flow.settings import FlowSettings
@@ -370,13 +370,14 @@ def measure_study(
         flow = indices(field, *shapes)
         judged = grade(case, field, flow)
         left = {"unsettled_fraction": field.unsettled_fraction} if isfinite(field.unsettled_fraction) else {}
-        treatments[name]["flow"] = flow | left
+        of_flow = case if name == BARE else case.resisted_as(fields[BARE])
+        treatments[name]["flow"] = flow | left | balance(of_flow, field)
         if name == BARE:
             bare = flow
         else:
             treatments[name]["change"] = ratios(bare, flow)
         quality = {"grade": judged.level, "reasons": list(judged.reasons)} | judged.measures
-        treatments[name]["quality"] = quality | computation_of(case, field)
+        treatments[name]["quality"] = quality | computation_of(of_flow, field)
     for treatment in settings.treatments:
         for implant in treatment.implants if treatment.name in implants else ():
             measures = treatments[treatment.name]["implants"][implant.id]

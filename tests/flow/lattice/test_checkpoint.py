@@ -36,6 +36,13 @@ def vessel() -> Vessel:
     return trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=10.0, radius_mm=2.0), edge_mm=0.4)))
 
 
+@cache
+def fork() -> Vessel:
+    straight = phantoms.tube(length_mm=10.0, radius_mm=2.0)
+    branched = phantoms.with_branch(straight, abscissa_mm=4.0, direction=[1, 0, 1], radius_mm=1.2, length_mm=6.0)
+    return trace(Vessel(phantoms.phantom_surface(branched, edge_mm=0.4)))
+
+
 def screen() -> Sheet:
     x, y = (a.ravel() for a in np.meshgrid(np.arange(-2.2, 2.2, 0.1), np.arange(-2.2, 2.2, 0.1)))
     n = len(x)
@@ -61,7 +68,9 @@ class Stopping(Unfinished):
 def computed(kind: str) -> tuple[FlowCase, FlowField | None, FlowField]:
     """A case, the flow from which it starts, and its own flow in one go."""
     settings = PULSE if "pulsatile" in kind else SETTINGS
-    case = vessel_case(vessel(), settings)
+    if "windkessel" in kind:
+        settings = replace(settings, outlets="windkessel")
+    case = vessel_case(fork() if "windkessel" in kind else vessel(), settings)
     start = None
     if kind == "stented":
         start = simulate_case(case)
@@ -73,7 +82,9 @@ def computed(kind: str) -> tuple[FlowCase, FlowField | None, FlowField]:
     return case, start, simulate_case(case, start=start)
 
 
-@pytest.mark.parametrize("kind", ["steady", "pulsatile", "stented", "close-up", "pulsatile close-up"])
+@pytest.mark.parametrize(
+    "kind", ["steady", "pulsatile", "stented", "close-up", "pulsatile close-up", "windkessel", "pulsatile windkessel"]
+)
 @pytest.mark.parametrize("saves", [2, 9])
 def test_a_stopped_flow_goes_on_to_the_same_bits(
     kind: str, saves: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

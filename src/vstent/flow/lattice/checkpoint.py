@@ -28,6 +28,7 @@ def pack(state: State) -> Saved:
         "populations": state.populations[: 19 * state.addressing.stride],
         "source": state.links.source,
         "openings": state.links.openings,
+        "course": state.built[0].course,
         "refill": state.refill.refill,
         "history": np.array(state.history),
         **_columns("last", state.snapshots, len(state.domain.cells)),
@@ -62,6 +63,7 @@ def unpack(case: FlowCase, cell_size_mm: float, saved: Saved, close_up: CloseUp 
     check_s, kept = float(saved["check_s"]), int(saved["kept"])
     state = build(case, cell_size_mm, check_s, saved["pace"], close_up=close_up, start=None, kept=kept)
     state.history = list(saved["history"])
+    state.built[0].course[:] = saved["course"]
     take_pace(state)
     state.populations[: 19 * state.addressing.stride] = saved["populations"]
     state.links.source[:] = saved["source"]

@@ -220,6 +220,7 @@ def assembled(chosen: CloseUp, inner: FlowField) -> FlowField:
         outlets_mL_s=outer.outlets_mL_s,
         inlet_pressure_Pa=outer.inlet_pressure_Pa,
         outlet_pressure_Pa=outer.outlet_pressure_Pa,
+        common_pressure_Pa=outer.common_pressure_Pa,
         is_converged=inner.is_converged and outer.is_converged,
         unsettled_fraction=max(inner.unsettled_fraction, outer.unsettled_fraction),
         advice=(

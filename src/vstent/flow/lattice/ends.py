@@ -10,9 +10,9 @@ from typing import assert_never
 import numpy as np
 
 from vstent.flow import sampling
-from vstent.flow.case import FlowCase
+from vstent.flow.case import PHASES, FlowCase
 from vstent.flow.domain import Domain
-from vstent.flow.ends import FlowRate, Inflow, Pressure
+from vstent.flow.ends import FlowRate, Inflow, Pressure, Resistance
 from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.scales import Scales
@@ -46,8 +46,9 @@ class Ends:
         usual, shape = self._at(self.close_up, patches, links)
         wanted = usual[:, d3q19.WANTED].copy()
         phases = () if self.close_up is None else self.close_up.outer.phases
-        if not phases:
-            return usual, wanted, np.zeros((1, len(patches))), shape[None]
+        if not phases:  # the flow through resistances is adjusted at every check of a cycle (see `stepping.follow`)
+            count = PHASES if self.case.resistances and self.case.waveform is not None else 1
+            return usual, wanted, np.zeros((count, len(patches))), np.repeat(shape[None], count, axis=0)
         moments = [self._at(self._outside.at_phase(phase), patches, links) for phase in phases]
         factor = self.case.inflow_factor(np.array([phase.time_s for phase in phases]))
         course = np.stack([rows[:, d3q19.WANTED] for rows, _ in moments]) - factor[:, None] * wanted
@@ -62,11 +63,15 @@ class Ends:
         """Return the row and profile coefficients (l, 2) of one end, which is an opening or a cut."""
         part = patch - 1 - len(self.case.vessel.openings)
         if now is None or part < 0:
-            return self._opening(patch - 1, links)
+            return self._opening(now, patch - 1, links)
         return self._entry(now, part, links) if self._outside.inflow_mL_s[part] > 0 else self._exit(now, part, links)
 
-    def _opening(self, k: int, links: Ints) -> tuple[Floats, Floats]:
-        """Return the row and profile coefficients (l, 2) of opening `k`."""
+    def _opening(self, now: CloseUp | None, k: int, links: Ints) -> tuple[Floats, Floats]:
+        """Return the row and profile coefficients (l, 2) of opening `k`.
+
+        Of several resistances the widest outlet has zero pressure and takes the rest. In a refined region the flow
+        through the others is that of the surrounding flow.
+        """
         opening, end = self.case.vessel.openings[k], self.case.ends[k]
         area = opening.area_mm2 / self.domain.cell_size_mm**2
         shape = np.zeros((len(links), 2))
@@ -75,9 +80,13 @@ class Ends:
                 kind, mean_mL_s, shape = d3q19.INFLOW, end.mean_mL_s, self._developed(k, links, area)
             case FlowRate():
                 kind, mean_mL_s = d3q19.OUTFLOW, end.mean_mL_s
-            case Pressure():
+            case Resistance() if k > len(self.case.vessel.inlets):
+                kind, mean_mL_s = d3q19.OUTFLOW, end.mean_mL_s
+                if now is not None:
+                    mean_mL_s = float(now.outer.outlets_mL_s[k - len(self.case.vessel.inlets)])
+            case Pressure() | Resistance():
                 kind, mean_mL_s = d3q19.PRESSURE, 0.0
-                shape[:, 0] = end.pressure_Pa / self.scales.pressure_Pa
+                shape[:, 0] = end.pressure_Pa / self.scales.pressure_Pa if isinstance(end, Pressure) else 0.0
             case _:
                 assert_never(end)
         speed = mean_mL_s / opening.area_mm2 / self.scales.speed_m_s

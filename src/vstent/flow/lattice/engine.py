@@ -48,6 +48,7 @@ class AbstractLattice(AbstractEngine[State]):
     refined_by: ClassVar[tuple[str, ...]] = ("cell_size_mm", "lattice_speed")
     closes_up: ClassVar[bool] = True
     runs_on_gpu: ClassVar[bool] = True
+    has_resistances: ClassVar[bool] = True
 
     def cost(self, case: FlowCase) -> str:
         """Return a sentence with grid spacing, memory and run time of a case; refuse it if it cannot run."""
@@ -161,7 +162,10 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
         """
         if state.since_check:
             return None
-        return float("nan") if state.snapshots[-1].is_lost else cycle_change(np.array(state.history))
+        if state.snapshots[-1].is_lost:
+            return float("nan")
+        change = cycle_change(np.array(state.history))
+        return max(change, _outflow_error(state)) if state.has_resistances and np.isfinite(change) else change
 
     def max_checks(self, state: State) -> int:
         """Return the number of phases in the maximum number of cycles."""
@@ -190,7 +194,21 @@ def _left(state: State) -> float:
     # Not zero while sound waves leave through the openings.
     inflow_error = float(np.abs(state.snapshots[-1].outflow[enters] + wanted).sum() / wanted.sum())
     of_field = SHARE_OF_FIELD * field_left(fields)
-    return max(quantities_left(np.array(state.history)), of_field, INFLOW_WEIGHT * inflow_error)
+    left = max(quantities_left(np.array(state.history)), of_field, INFLOW_WEIGHT * inflow_error)
+    return max(left, INFLOW_WEIGHT * _outflow_error(state)) if state.has_resistances else left
+
+
+def _outflow_error(state: State) -> float:
+    """Return how much the flow through an outlet differs from what its resistance answers, as a fraction of its mean.
+
+    It is the root mean square over the last cycle, or that of the last check. The widest outlet takes the rest.
+    """
+    wanted_mL_s = stepping.answered_mL_s(state, stepping.at_outlets_Pa(state))
+    is_set, outlet, _ = stepping.of_outlets(state)
+    last = list(state.snapshots)[-len(wanted_mL_s) :]
+    wrong_mL_s = np.array([one.outflow_mL_s[is_set] for one in last]) - wanted_mL_s[:, outlet]
+    means_mL_s = np.abs(wanted_mL_s[:, outlet].mean(axis=0))
+    return float((np.sqrt((wrong_mL_s**2).mean(axis=0)) / means_mL_s).max(initial=0.0))
 
 
 def _mean(state: State) -> Mean:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from vstent.deployment.struts import thickness_mm
 from vstent.flow import domain as domains
 from vstent.flow.case import FlowField, Level, Phase
+from vstent.flow.ends import outflows
 from vstent.flow.engines import Outcome
 from vstent.flow.lattice import close_up as close_ups
 from vstent.flow.lattice.setup import CELL_REYNOLDS
@@ -100,6 +101,10 @@ def field_of(
     speed_m_s = np.max([np.linalg.norm(one, axis=1) for one in moments_m_s], axis=0)
     too_coarse += domains.too_fast(domain, np.where(is_vessel, speed_m_s, 0.0), state.case.blood, CELL_REYNOLDS)
     on_gpu = "" if state.device is None else f" Time steps were launched on the GPU {state.device.how}."
+    common_Pa = 0.0
+    if state.has_resistances:
+        ends, inflow_mL_s = state.case.resistances, np.array([state.case.inflow_mL_s])
+        common_Pa = float(outflows(ends, inflow_mL_s, np.nan_to_num(outlet_Pa)[None])[1][0])
     field = FlowField(
         levels=(Level.of(domain, flow.velocity_m_s, flow.pressure_Pa, flow.mean_speed_m_s),),
         wall=vessel.lumen,
@@ -120,6 +125,7 @@ def field_of(
         phases=phases,
         wire_force_N=None if wires is None else force_N(state),
         mean_shear_Pa=flow.mean_shear_Pa,
+        common_pressure_Pa=common_Pa,
         neck_inflow_mL_s=flow.neck_inflow_mL_s,
     )
     return field if state.close_up is None else close_ups.assembled(state.close_up, field)

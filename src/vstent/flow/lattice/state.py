@@ -165,6 +165,11 @@ class State:
     """The run on a GPU (`on_gpu.Device`), once it has been copied there; else None."""
 
     @property
+    def has_resistances(self) -> bool:
+        """Return whether the flow out follows the pressure; in a refined region it is that of the surrounding flow."""
+        return self.close_up is None and bool(self.case.resistances)
+
+    @property
     def steps_per_check(self) -> int:
         """Return the number of time steps from the last check to the next."""
         return int(self.pace[len(self.history) % len(self.pace)])

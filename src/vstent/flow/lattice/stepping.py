@@ -14,6 +14,7 @@ from vstent.devices.stent import Stent
 from vstent.flow import domain as domains
 from vstent.flow import sampling
 from vstent.flow.case import FlowCase, FlowField
+from vstent.flow.ends import outflows
 from vstent.flow.lattice import close_up as close_ups
 from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.gpu import require_gpu, told
@@ -24,13 +25,21 @@ from vstent.flow.lattice.screen import build_screen
 from vstent.flow.lattice.setup import Grid, Refill, address, build_links, thickest
 from vstent.flow.lattice.state import DEFER_PAIRS, DEFER_PART, Probe, Snapshot, State, speeds
 from vstent.geometry.vessel import Vessel
-from vstent.kernels.arrays import Floats, Ints
+from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.units import M_PER_MM
 
 SLICE_UPDATES: Final = 2e8
 """Number of cell updates between two looks at the clock: a few seconds on one core."""
 GPU_SLICE_UPDATES: Final = 2e9
 """The same on a GPU: some tenths of a second."""
+
+FOLLOWED: Final = 0.5
+"""Part by which the flow through resistances follows the pressure at a check of a steady flow: a sudden change of the
+flow changes the pressure, because blood is accelerated."""
+
+LEARNED: Final = 2
+"""Number of harmonics of a pulse for which the delay of an outlet is corrected: cycles that correct more converge
+slowly."""
 
 _GRIDS: WeakKeyDictionary[Vessel, dict[tuple[float, tuple[Stent, ...]], Grid]] = WeakKeyDictionary()
 """Grids of whole vessels by grid spacing and resolved wires, as long as the vessel exists."""
@@ -84,6 +93,8 @@ def build(
         check_s=check_s,
         snapshots=deque(maxlen=kept),
     )
+    if state.has_resistances:
+        _ask(state, answered_mL_s(state, _before_Pa(state, start)))
     if start is None:
         return state
     pulses = case.waveform is not None and start.phases
@@ -97,6 +108,17 @@ def build(
         moments = d3q19.moments(f, stride, links.place[links.start[k] : links.start[k + 1]])
         links.openings[k, d3q19.MEMORY] = moments[:, 0].mean()
     return state
+
+
+def _before_Pa(state: State, start: FlowField | None) -> Floats:
+    """Return the pressure (m, k) at the outlets at the checks of a cycle of the flow before, 0 where there is none."""
+    vessel, count = state.case.vessel, len(state.links.course)
+    if start is None:
+        return np.zeros((count, len(vessel.outlets)))
+    if len(start.phases) != count:
+        return np.tile(np.nan_to_num(start.outlet_pressure_Pa), (count, 1))
+    sections_Pa = [domains.section_pressure_Pa(vessel, start.finest, one.pressure_Pa[-1]) for one in start.phases]
+    return np.asarray(np.nan_to_num(sections_Pa)[:, len(vessel.inlets) :], dtype=np.float64)
 
 
 def prepare(case: FlowCase, cell_size_mm: float) -> None:
@@ -161,12 +183,87 @@ def step(state: State) -> None:
             state.snapshots.append(now)
             state.history.append(np.zeros(0))
             state.since_check = 0
+            if state.has_resistances and len(state.history) % len(state.links.course) == 0:
+                _follow(state)
             _keep_pace(state)
             if state.device is not None:
                 with told():
                     if state.device.begin(*_pairs(state, _slice_steps(state))):
                         state.begun_s = perf_counter()
             state.history[-1] = monitored(state, now)
+
+
+def answered_mL_s(state: State, pressure_Pa: Floats) -> Floats:
+    """Return the flow rates (m, k) through resistances at the checks of a cycle, from the pressures (m, k) there.
+
+    In a steady flow there is a single check.
+    """
+    case, time_s = state.case, _cycle_s(state)
+    return outflows(case.resistances, case.inflow_mL_s * case.inflow_factor(time_s), pressure_Pa, float(time_s[-1]))[0]
+
+
+def at_outlets_Pa(state: State) -> Floats:
+    """Return the pressure (m, k) at the outlets at the last check of a steady flow, or at those of the last cycle."""
+    vessel, last = state.case.vessel, list(state.snapshots)[-len(state.links.course) :]
+    sections_Pa = [domains.section_pressure_Pa(vessel, state.domain, one.pressure_Pa.astype(float)) for one in last]
+    return np.asarray(np.nan_to_num(sections_Pa)[:, len(vessel.inlets) :], dtype=np.float64)
+
+
+def _cycle_s(state: State) -> Floats:
+    """Return the times (m,) in a cycle of the rows of `Links.course`."""
+    return np.asarray(state.check_s * (1 + np.arange(len(state.links.course))), dtype=np.float64)
+
+
+def _follow(state: State) -> None:
+    """Adjust the flow through resistances at the outlets to the pressures at the last checks.
+
+    In a pulsatile flow the low harmonics of what the outlets let through less than asked for are added: an outlet
+    follows a changing flow rate with a delay.
+    """
+    flow_mL_s, asked_mL_s = answered_mL_s(state, at_outlets_Pa(state)), _asked_mL_s(state)
+    if state.case.waveform is None:
+        _ask(state, asked_mL_s + FOLLOWED * (flow_mL_s - asked_mL_s))
+        return
+    is_set, outlet, _ = of_outlets(state)
+    through_mL_s = np.array([one.outflow_mL_s[is_set] for one in list(state.snapshots)[-len(asked_mL_s) :]])
+    missed = np.fft.rfft(asked_mL_s[:, outlet] - through_mL_s, axis=0)
+    missed[0] = missed[LEARNED + 1 :] = 0.0
+    flow_mL_s[:, outlet] += np.fft.irfft(missed, len(asked_mL_s), axis=0)
+    _ask(state, flow_mL_s)
+
+
+def _asked_mL_s(state: State) -> Floats:
+    """Return the flow rates (m, k) that are imposed at the outlets at the checks of a cycle."""
+    result = _usual_mL_s(state)
+    is_set, outlet, speed_mL_s = of_outlets(state)
+    result[:, outlet] += state.built[0].course[:, is_set] * speed_mL_s
+    return result
+
+
+def _ask(state: State, flow_mL_s: Floats) -> None:
+    """Impose flow rates (m, k) at the outlets at the checks of a cycle; the widest takes the rest."""
+    links, built = state.links, state.built[0]
+    is_set, outlet, speed_mL_s = of_outlets(state)
+    built.course[:, is_set] = (flow_mL_s - _usual_mL_s(state))[:, outlet] / speed_mL_s
+    if links is not built:
+        links.course[:] = state.scales.step_s * int(state.pace[0]) / state.check_s * built.course
+
+
+def _usual_mL_s(state: State) -> Floats:
+    """Return the flow rates (m, k) at the outlets without `Links.course`: they follow the waveform."""
+    means_mL_s = [end.mean_mL_s for end in state.case.resistances]
+    return np.outer(state.case.inflow_factor(_cycle_s(state)), means_mL_s)
+
+
+def of_outlets(state: State) -> tuple[Bools, Ints, Floats]:
+    """Return which ends have a flow rate imposed, their outlets (o,), and the flow rate (o,) of a speed of 1.
+
+    The speed is that of `Links.course` before the time step changes.
+    """
+    is_set = state.links.openings[:, d3q19.KIND] == d3q19.OUTFLOW
+    outlet = state.links.patch[is_set] - 1 - len(state.case.vessel.inlets)
+    area_mm2 = np.array([state.case.vessel.outlets[k].area_mm2 for k in outlet])
+    return is_set, outlet, area_mm2 * state.scales.cell_m * int(state.pace[0]) / state.check_s
 
 
 def _keep_pace(state: State) -> None:

@@ -6,8 +6,9 @@ from typing import Any, Final, assert_never
 
 import numpy as np
 
+from vstent.errors import InputError
 from vstent.flow.case import FlowCase
-from vstent.flow.ends import End, FlowRate, Inflow, Pressure
+from vstent.flow.ends import End, FlowRate, Inflow, Pressure, Resistance
 from vstent.flow.openfoam.dictionary import foam_file, vector
 from vstent.flow.openfoam.setup import FoamSetup
 from vstent.flow.profile import developed_profile
@@ -24,6 +25,12 @@ ZERO_GRADIENT: Final[dict[str, Any]] = {"type": "zeroGradient"}
 """Pressure where the velocity is prescribed."""
 AT_REST: Final[dict[str, Any]] = {"value": "uniform (0 0 0)"}
 """Initial velocity at an opening."""
+
+NO_RESISTANCES: Final = (
+    "an OpenFOAM case cannot have resistances or Windkessels at its outlets: give fixed shares (--outlets split or "
+    "murray)"
+)
+"""Message where the outlets of a case have resistances."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +81,8 @@ def _condition(case: FlowCase, setup: FoamSetup, opening: Opening, end: End, sec
             free = {"type": "inletOutlet", "inletValue": "uniform (0 0 0)"} | AT_REST
             value = f"uniform {end.pressure_Pa / case.blood.density_kg_m3:.9g}"
             return Condition(free, {"type": "fixedValue", "value": value}, {})
+        case Resistance():
+            raise InputError(NO_RESISTANCES)
         case _:
             assert_never(end)
 
