@@ -27,6 +27,8 @@ FIRST: Final = {
     "device": (
         "deployed_length_mm",
         "neck_metal_coverage_fraction",
+        "neck_union_coverage_fraction",
+        "overlap_length_mm",
         "apposed_fraction",
         "max_wall_gap_mm",
         "neck_to_proximal_end_mm",

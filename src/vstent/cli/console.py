@@ -60,6 +60,8 @@ DEVICE_ROWS: Final = (
 """Rows of the comparison of deployments: title and key of the measure."""
 
 
+NECK_UNION: Final = "neck_union_coverage_fraction"
+"""Key of the metal coverage of the neck by all devices of a treatment."""
 QUIET_S: Final = 30.0
 """Time between progress lines where the output is not a terminal, in s."""
 
@@ -132,6 +134,9 @@ def comparison_table(metrics: Mapping[str, Any]) -> Table:
         ]
         if any(cells):
             table.add_row(title, "", *cells)
+    unions = [treatment.get("together", {}).get(NECK_UNION) for treatment in treatments.values()]
+    if any(union is not None for union in unions):
+        table.add_row("Metal on the neck, all devices", "", *(_cell(NECK_UNION, union) for union in unions))
     if bare:
         table.add_section()
         _add_flow_rows(table, metrics, {key: title for title, key in ROWS})

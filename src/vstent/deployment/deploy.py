@@ -10,6 +10,7 @@ from vstent.deployment import sizing, wires
 from vstent.deployment.advice import advise
 from vstent.deployment.braid import ConstantWire
 from vstent.deployment.method import AbstractMethod, Course, Placement, Progress, Zhong2016, laid_inside, run
+from vstent.deployment.nested import kept_inside
 from vstent.deployment.wall import landing_wall
 from vstent.devices.catalogue import find_design
 from vstent.devices.design import Design, Size
@@ -17,6 +18,7 @@ from vstent.devices.formulas import compacted
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import InputError
 from vstent.geometry.vessel import Anatomy
+from vstent.kernels.arrays import Floats
 from vstent.units import MM_PER_UM
 
 METHODS: dict[str, type[ConstantWire] | type[Zhong2016]] = {"constant_wire": ConstantWire, "zhong2016": Zhong2016}
@@ -95,9 +97,13 @@ def deploy(
 
     course = laid_inside(opened_at, propose_landing(design, anatomy, size)) if landing is None else opened_at(landing)
     nodes_mm, crowns = course.opened.contour.nodes_mm, course.opened.crowns
-    drawn = wires.draw(design, size, nodes_mm, wall, crowns)
-    stent = Stent(design, size, nodes_mm, course.opened.abscissa_mm, *drawn, crowns.shift_mm)
-    contact = wall.contact(nodes_mm.reshape(-1, 3))
+
+    def drawn(nodes_mm: Floats) -> Stent:
+        found = wires.draw(design, size, nodes_mm, wall, crowns)
+        return Stent(design, size, nodes_mm, course.opened.abscissa_mm, *found, crowns.shift_mm)
+
+    stent = kept_inside(drawn(nodes_mm), drawn, inside, anatomy.parent.landing_surface)
+    contact = wall.contact(stent.nodes_mm.reshape(-1, 3))
     gap_mm = np.maximum(contact.distance_mm - dd_mm, 0.0).reshape(nodes_mm.shape[:2])
     return Deployment(
         stent=stent,

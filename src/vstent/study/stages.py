@@ -17,6 +17,7 @@ from vstent.anatomy.read import read_vessel
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
+from vstent.deployment.coverage import together
 from vstent.deployment.deploy import deploy, propose_landing, propose_size
 from vstent.deployment.measure import measure
 from vstent.devices.catalogue import find_design, find_sizes
@@ -343,6 +344,8 @@ def measure_study(
     treatments: dict[str, dict[str, Any]] = {BARE: {}} if fields else {}
     for name, deployed in implants.items():
         treatments[name] = {"implants": {id_: measure(anatomy, one) for id_, one in deployed.items()}}
+        if len(deployed) > 1:
+            treatments[name]["together"] = together(anatomy, [one.stent for one in deployed.values()])
     if fields:
         case = flow_case(anatomy, (), settings.flow)
     for name, field in fields.items():
