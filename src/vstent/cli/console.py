@@ -56,6 +56,9 @@ DEVICE_ROWS: Final = (
     ("Deployed length", "deployed_length_mm"),
     ("Apposed", "apposed_fraction"),
     ("Metal coverage over the neck", "neck_metal_coverage_fraction"),
+    ("Basket, height", "basket_height_mm"),
+    ("Basket, stands out into the artery", "protrusion_mm"),
+    ("Basket, neck left open", "neck_uncovered_fraction"),
 )
 """Rows of the comparison of deployments: title and key of the measure."""
 
@@ -129,6 +132,7 @@ def comparison_table(metrics: Mapping[str, Any]) -> Table:
             " + ".join(
                 f"{_cell(key, implant.get(key))} {_spaced(ends(implant, key))}".rstrip()
                 for implant in treatment["implants"].values()
+                if key in implant
             )
             for treatment in treatments.values()
         ]

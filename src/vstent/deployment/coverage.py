@@ -33,7 +33,7 @@ def coverage_fractions(stent: Stent) -> Floats:
     return covered_fractions(stent.nodes_mm, *stent.pieces_mm, SAMPLES_PER_QUAD)
 
 
-def _middles_mm(nodes_mm: Floats) -> Floats:
+def quad_middles_mm(nodes_mm: Floats) -> Floats:
     """Return the middles (rows - 1, columns, 3) of the quads of a contour (rows, columns, 3)."""
     along_mm = 0.25 * (nodes_mm[1:] + nodes_mm[:-1])
     return along_mm + np.roll(along_mm, -1, axis=1)
@@ -85,7 +85,7 @@ def density(anatomy: Anatomy, stent: Stent) -> Measures:
     if len(pores_mm):
         found["pore_density_per_mm2"] = float(pores.sum() / pore_mm2.sum())
     if anatomy.aneurysms:
-        on_neck = is_over_neck(anatomy, _middles_mm(stent.nodes_mm).reshape(-1, 3)).reshape(covered.shape)
+        on_neck = is_over_neck(anatomy, quad_middles_mm(stent.nodes_mm).reshape(-1, 3)).reshape(covered.shape)
         if on_neck.any():
             found["neck_metal_coverage_fraction"] = float(np.average(covered[on_neck], weights=quad_mm2[on_neck]))
         on_neck = is_over_neck(anatomy, pores_mm)
@@ -116,7 +116,7 @@ def together(anatomy: Anatomy, stents: Sequence[Stent]) -> Measures:
         )
         covered = covered_fractions(nodes_mm, starts_mm, ends_mm, half_mm, SAMPLES_PER_QUAD)
         areas_mm2 = anatomy.parent.landing_surface.areas_mm2.reshape(2, *covered.shape).sum(axis=0)
-        on_neck = is_over_neck(anatomy, _middles_mm(nodes_mm).reshape(-1, 3)).reshape(covered.shape)
+        on_neck = is_over_neck(anatomy, quad_middles_mm(nodes_mm).reshape(-1, 3)).reshape(covered.shape)
         if on_neck.any():
             found["neck_union_coverage_fraction"] = float(np.average(covered[on_neck], weights=areas_mm2[on_neck]))
     return found

@@ -8,15 +8,16 @@ import numpy as np
 
 from vstent.deployment import sizing, wires
 from vstent.deployment.advice import advise
+from vstent.deployment.basket import deploy_basket
 from vstent.deployment.braid import ConstantWire
 from vstent.deployment.method import AbstractMethod, Course, Placement, Progress, Zhong2016, laid_inside, run
 from vstent.deployment.nested import kept_inside
 from vstent.deployment.wall import landing_wall
 from vstent.devices.catalogue import find_design
-from vstent.devices.design import Design, Size
+from vstent.devices.design import Basket, Design, Size
 from vstent.devices.formulas import compacted
 from vstent.devices.stent import Deployment, Landing, Stent
-from vstent.errors import InputError
+from vstent.errors import InputError, LandingError
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Floats
 from vstent.units import MM_PER_UM
@@ -40,7 +41,7 @@ def deploy(
     inside: Sequence[Stent] = (),
     progress: Progress | None = None,
 ) -> Deployment:
-    """Deploy a device in the parent artery.
+    """Deploy a device in the parent artery, or a basket in the largest sac.
 
     Parameters
     ----------
@@ -52,7 +53,8 @@ def deploy(
         Size of the device; None proposes one.
     landing : Landing, optional
         Where the center, the proximal or the distal end lies. None centers the device on the neck of the largest
-        aneurysm, or as near to it as the ends of the artery allow.
+        aneurysm, or as near to it as the ends of the artery allow. A basket is landed with its proximal end, at a
+        height above the middle of the neck; None is 0.
     method : AbstractMethod or str, optional
         ``constant_wire``, ``zhong2016`` (the contour of the paper alone), or a method with other weights.
     compaction_fraction : float, optional
@@ -83,6 +85,10 @@ def deploy(
     """
     began = time.perf_counter()
     design = find_design(design) if isinstance(design, str) else design
+    if isinstance(design, Basket):
+        if inside:
+            raise LandingError(f"{design.name} lies in a sac alone: give it a treatment of its own.")
+        return deploy_basket(design, anatomy, size, landing or Landing(0.0, "proximal"))
     if isinstance(method, str):
         if method not in METHODS:
             raise InputError(f"There is no deployment method called {method!r}. Choose one of {', '.join(METHODS)}.")

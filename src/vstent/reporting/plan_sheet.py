@@ -9,6 +9,7 @@ import numpy as np
 from vstent.anatomy.landing_zones import ZONE_MM, neck_span_mm
 from vstent.deployment.method import laid_inside
 from vstent.deployment.sketch import measured_wall, sketch
+from vstent.devices.design import Basket
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.errors import LandingError
 from vstent.geometry.vessel import Anatomy
@@ -118,6 +119,17 @@ def _picture(case: Planned, name: str) -> Picture:
 def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the table of device, landing zones and fit, with bands where there are any."""
     stent = deployment.stent
+    if isinstance(stent.design, Basket):
+        keys = {
+            "basket_width_mm": "Width in the sac",
+            "basket_height_mm": "Height in the sac",
+            "protrusion_mm": "Length that stands out into the artery",
+            "neck_uncovered_fraction": "Part of the neck that it leaves open",
+            "neck_metal_coverage_fraction": "Metal coverage over the neck",
+            "apposed_fraction": "Apposed",
+        }
+        cells = [(words, format_value(key, metrics[key])) for key, words in keys.items() if key in metrics]
+        return [("Device and label size, width x height", f"{stent.design.name} {stent.size.label}"), *cells]
     rows = [
         ("Device and label size", f"{stent.design.name} {stent.size.label}"),
         ("Deployed length (range for the uncertainty of diameters)", _length(anatomy, deployment)),
@@ -168,6 +180,8 @@ def _length(anatomy: Anatomy, deployment: Deployment) -> str:
 
 def _alternative_rows(case: Planned, stent: Stent) -> Sequence[tuple[str, str, str]]:
     """Return the two best neighboring sizes of a device."""
+    if isinstance(stent.design, Basket):
+        return [("not ranked", "", "Sizes of baskets are not ranked.")]
     found = alternatives(case.anatomy, stent.design, stent.size)
     return [(one.size.label, f"{one.score:.2f}" if one.is_suitable else "unsuitable", one.reason) for one in found] or [
         ("none fits", "", "")
