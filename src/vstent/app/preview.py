@@ -28,11 +28,11 @@ from vstent.deployment.deploy import propose_landing
 from vstent.deployment.measure import measure
 from vstent.deployment.method import laid_inside
 from vstent.deployment.sketch import MeasuredWall, Sketch, measured_wall, sketch
-from vstent.devices.catalogue import find_design
+from vstent.devices.catalogue import baskets, find_design
 from vstent.devices.formulas import coverage_fraction, free_diameters_mm
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.devices.treatment import BARE, Implant, Treatment
-from vstent.errors import InputError, ReadError, VstentError
+from vstent.errors import DeviceError, InputError, ReadError, VstentError
 from vstent.flow.case import FlowField
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.problem import vessel_case
@@ -141,7 +141,9 @@ class Preview:
         return self._cached(("wall", self.case.state.anatomy, path, *asked, *_before(treatment, implant)), prepare)
 
     def _outer(self, treatment: Treatment, implant: Implant) -> list[Stent]:
-        """Return the deployed devices inside which an implant opens."""
+        """Return the deployed devices inside which an implant opens; a DeviceError says that it is a basket."""
+        if implant.device.casefold() in baskets():
+            raise DeviceError(f"{implant.device} is a basket: plan it with vstent run on the command line.")
         return [self.deployment(treatment, _implant(treatment, name)).stent for name in implant.inside]
 
     def _of_implant(self, what: str, treatment: Treatment, implant: Implant, compute: Callable[[], Found]) -> Found:
