@@ -1,9 +1,10 @@
 """Deploy a basket in a sac: a closed braid of constant wire length between the neck, the wall and the dome.
 
-The basket lies on the path ``sac``, a straight axis from the middle of the neck through the middle of the sac to the
-dome. It is as wide as the free device or as the sac's wall allows, row by row and around the axis. Its wires keep their
-length, so that a narrower basket is taller: one factor on its height is found for which as many rows of crossings fit
-along the mean section as in the free device (`vstent.devices.formulas.rows_along`).
+The basket lies on the path of the sac, from the middle of the neck through the middles of its sections to the dome. It
+is as wide as the free device or as the wall allows, row by row and around the axis. Its wires keep their length, so
+that a narrower basket is taller: one factor on its height is found for which as many rows of crossings fit along the
+mean section as in the free device (`vstent.devices.formulas.rows_along`). Then the crossings move inside the wall until
+the pieces of wire have their length.
 """
 
 import time
