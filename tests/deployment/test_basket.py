@@ -21,6 +21,7 @@ from vstent.errors import InputError, LandingError
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Aneurysm
 from vstent.plan.rank import rank
+from vstent.reporting.definitions import DEFINITIONS
 from vstent.study.stages import deploy_implant
 
 SPHERE = find_design("web_sls")
@@ -151,6 +152,26 @@ def test_a_shift_lifts_a_basket_from_the_neck():
     stent = deploy_implant(implant, sac).stent
     assert stent.size.label == "7.00 x 4 mm"
     assert stent.proximal_abscissa_mm == pytest.approx(1.5, abs=0.01)
+
+
+def test_every_measure_of_a_basket_is_defined():
+    sac = ball(3.5, 2.2)
+    found = measure(sac, deploy(BARREL, sac))
+    assert [key for key in found if key not in DEFINITIONS] == ["device", "size"]
+
+
+def test_a_basket_in_a_turned_and_moved_sac_is_the_same_turned_and_moved():
+    sac, angle = ball(3.5, 2.2), 0.7
+    turn = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+    (one,) = sac.aneurysms
+
+    def moved(surface):
+        return Surface(surface.vertices_mm @ turn.T + [1, 2, 3], surface.faces)
+
+    other = replace(sac, aneurysms=(Aneurysm(moved(one.sac), moved(one.neck), one.neck_mm @ turn.T + [1, 2, 3]),))
+    before, after = (measure(anatomy, deploy(BARREL, anatomy)) for anatomy in (sac, other))
+    for key in ("basket_width_mm", "basket_height_mm", "protrusion_mm", "neck_metal_coverage_fraction"):
+        assert after[key] == pytest.approx(before[key], rel=0.01)
 
 
 @pytest.mark.parametrize("key", baskets())

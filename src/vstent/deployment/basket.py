@@ -53,6 +53,8 @@ RELAXATIONS, RELAXED_SHARE, INSIDE_EVERY = 200, 0.2, 10
 in which the wall puts them back."""
 SECTORS: Final = 72
 """Number of sectors around the axis in which the outline is measured."""
+RIM_MM: Final = 0.01
+"""Height of the lowest section above the lowest point of the wall, in mm: rays through the rim meet it or not."""
 STATIONS: Final = 120
 """Number of sections of the sac that are measured along its axis."""
 
@@ -115,7 +117,7 @@ def room_of(aneurysm: Aneurysm, columns: int) -> Room:
     room = Room(
         origin_mm,
         np.stack([axis, first, np.cross(axis, first)]),
-        np.linspace(min(0.0, float(low_mm)), height_mm, STATIONS),
+        np.linspace(min(0.0, float(low_mm)) + RIM_MM, height_mm, STATIONS),
         np.zeros((STATIONS, 2)),
         np.zeros((STATIONS, columns)),
         wall,
