@@ -100,16 +100,16 @@ def test_a_narrower_basket_is_as_much_taller_as_its_wires_require(sac_mm):
     assert np.quantile(np.abs(wire_stretches(done.stent)), 0.95) < 0.02
 
 
-def test_a_basket_one_mm_wider_than_the_sac_gains_about_one_mm_in_height():
+def test_a_basket_one_mm_wider_than_the_sac_gains_two_thirds_of_a_mm_in_height():
     for size in (find_size(BARREL, diameter_mm=w, length_mm=h) for w, h in ((6.0, 4.0), (8.0, 5.0), (10.0, 6.0))):
         sac = pot(0.5 * size.diameter_mm - 0.5, 20.0)
         found = measure(sac, deploy(BARREL, sac, size=size, landing=Landing(3.0, "proximal")))
-        assert found["basket_height_mm"] - size.length_mm == pytest.approx(0.8, abs=0.2)
+        assert found["basket_height_mm"] - size.length_mm == pytest.approx(0.65, abs=0.1)
 
 
 def test_what_does_not_fit_below_the_dome_stands_out_of_the_neck_and_nothing_passes_the_wall():
     sac = ball(3.5, 2.2)
-    done = deploy(BARREL, sac)
+    done = deploy(BARREL, sac, size=find_size(BARREL, diameter_mm=8.0, length_mm=6.0))
     found = measure(sac, done)
     room = room_of(sac.aneurysms[0], BARREL.n_columns)
     assert found["protrusion_mm"] == pytest.approx(-done.stent.proximal_abscissa_mm, abs=0.02)
@@ -122,10 +122,14 @@ def test_what_does_not_fit_below_the_dome_stands_out_of_the_neck_and_nothing_pas
     assert "stands out" in done.advice
 
 
-def test_the_proposed_size_is_one_mm_wider_than_the_sac_and_one_lower():
-    sac = ball(3.0, 1.8)  # 6.0 mm wide and 5.4 mm high
+def test_the_proposed_size_is_one_mm_wider_than_the_sac_and_one_lower_and_lower_still_where_it_would_stand_out():
+    size = propose_basket(BARREL, pot(3.0, 6.4))
+    assert (size.diameter_mm, size.length_mm) == (7.0, 5.0)
+    sac = ball(3.5, 2.2)  # 7.0 mm wide and 6.2 mm high
     size = propose_basket(BARREL, sac)
-    assert (size.diameter_mm, size.length_mm) == (7.0, 4.0)
+    assert (size.diameter_mm, size.length_mm) == (8.0, 4.0)
+    assert deploy(BARREL, sac, size=size).stent.proximal_abscissa_mm >= -0.5
+    assert deploy(BARREL, sac, size=find_size(BARREL, diameter_mm=8.0, length_mm=5.0)).stent.proximal_abscissa_mm < -0.5
 
 
 def test_what_makes_no_sense_is_refused_in_a_sentence():

@@ -32,13 +32,15 @@ from vstent.units import MM_PER_UM
 
 WIDER_MM: Final = 1.0
 """Width of the proposed size above the sac's, and height below it, in mm: the rule of one up, one down."""
+OUT_MM: Final = 0.5
+"""Length, in mm, by which the end of the proposed size may lie below the middle of the neck."""
 BODY_FRACTION: Final = 0.9
 """Fraction of the largest radius above which a row belongs to the body of the basket, whose gaps are measured."""
 APPOSED_GAP_MM: Final = 0.1
 """Gap, in mm, below which a node of the body is apposed."""
 LOOSE_FRACTION: Final = 0.05
 """Fraction of the body that may have gaps without a note."""
-TOLD_MM: Final = 0.1
+TOLD_MM: Final = 0.5
 """Smallest length, in mm, by which a basket stands out and that is reported."""
 NEAR_MM: Final = 0.3
 """Distance, in mm, within which a node outside the wall is put back."""
@@ -156,17 +158,20 @@ def _across(axis: Floats, first: Floats) -> Floats:
 def propose_basket(basket: Basket, anatomy: Anatomy) -> Size:
     """Propose a size by the rule in use: one mm wider than the mean of the sac's widths, one lower than its height.
 
-    A LandingError says that there is no sac, or that its neck is wider than any size.
+    A lower one is proposed where that would stand out far into the artery. A LandingError says that there is no sac, or
+    that its neck is wider than any size.
     """
     room = room_of(_sac(anatomy, basket), basket.n_columns)
     fitting = [size for size in basket.sizes if size.diameter_mm > room.neck_width_mm]
     if not fitting:
         raise LandingError(_too_wide(basket, room, max(size.diameter_mm for size in basket.sizes)))
     wanted_mm, wanted_height_mm = room.width_mm + WIDER_MM, room.height_mm - WIDER_MM
-    return min(
-        fitting,
-        key=lambda size: (abs(size.diameter_mm - wanted_mm), abs(size.length_mm - wanted_height_mm), size.length_mm),
-    )
+    width_mm = min({size.diameter_mm for size in fitting}, key=lambda one: abs(one - wanted_mm))
+    same = sorted((size for size in fitting if size.diameter_mm == width_mm), key=lambda size: size.length_mm)
+    best = min(range(len(same)), key=lambda k: abs(same[k].length_mm - wanted_height_mm))
+    while best and _lies(basket, room, same[best], 0.0)[0][0] < -OUT_MM:
+        best -= 1
+    return same[best]
 
 
 def deploy_basket(basket: Basket, anatomy: Anatomy, size: Size | None, landing: Landing) -> Deployment:
@@ -181,22 +186,7 @@ def deploy_basket(basket: Basket, anatomy: Anatomy, size: Size | None, landing: 
     room, offset_mm = room_of(aneurysm, basket.n_columns), basket.wall_offset_um * MM_PER_UM
     if size.diameter_mm <= room.neck_width_mm:
         raise LandingError(_too_wide(basket, room, size.diameter_mm))
-    free_heights_mm, free_radius_mm = meridian_mm(basket, size)
-    rows = float(rows_along(basket, size, free_heights_mm, free_radius_mm)[-1])
-
-    def section(factor: float) -> tuple[Floats, Floats, Floats]:
-        heights_mm = factor * free_heights_mm
-        heights_mm = heights_mm + min(landing.abscissa_mm, room.height_mm - offset_mm - heights_mm[-1])
-        reach_mm = curves.interpolate(room.heights_mm, room.reach_mm, heights_mm) - offset_mm
-        radius_mm = np.maximum(np.minimum(free_radius_mm[:, None], reach_mm), basket.marker_radius_mm)
-        in_plane_mm = radius_mm[..., None] * circles(np.ones(len(heights_mm)), basket.n_columns)
-        return heights_mm, in_plane_mm, rows_along(basket, size, heights_mm, perimeters(in_plane_mm) / (2 * np.pi))
-
-    low, high = FACTORS
-    if not section(low)[2][-1] < rows < section(high)[2][-1]:
-        raise LandingError(f"{basket.name} {size.label} does not fit this sac. Choose another size.")
-    factor = brentq(lambda one: section(one)[2][-1] - rows, low, high, xtol=1e-5)
-    heights_mm, in_plane_mm, count = section(factor)
+    heights_mm, in_plane_mm, count = _lies(basket, room, size, landing.abscissa_mm)
     wanted = np.linspace(0.0, count[-1], grid(basket, size).rows)
     flat_mm = curves.interpolate(count, in_plane_mm.reshape(len(count), -1), wanted).reshape(len(wanted), -1, 2)
     row_mm = np.interp(wanted, count, heights_mm)
@@ -215,6 +205,30 @@ def deploy_basket(basket: Basket, anatomy: Anatomy, size: Size | None, landing: 
         history_mm=np.stack([nodes_mm, nodes_mm]),
         energy_mm2=np.zeros(2),
     )
+
+
+def _lies(basket: Basket, room: Room, size: Size, lowest_mm: float) -> tuple[Floats, Floats, Floats]:
+    """Return heights (m,), in-plane coordinates (m, columns, 2) and rows of crossings (m,) along the section in a sac.
+
+    The lower end lies at a height above the middle of the neck, or lower where the sac is not high enough.
+    """
+    offset_mm = basket.wall_offset_um * MM_PER_UM
+    free_heights_mm, free_radius_mm = meridian_mm(basket, size)
+    rows = float(rows_along(basket, size, free_heights_mm, free_radius_mm)[-1])
+
+    def section(factor: float) -> tuple[Floats, Floats, Floats]:
+        heights_mm = factor * free_heights_mm
+        heights_mm = heights_mm + min(lowest_mm, room.height_mm - offset_mm - heights_mm[-1])
+        reach_mm = curves.interpolate(room.heights_mm, room.reach_mm, heights_mm) - offset_mm
+        radius_mm = np.maximum(np.minimum(free_radius_mm[:, None], reach_mm), basket.marker_radius_mm)
+        in_plane_mm = radius_mm[..., None] * circles(np.ones(len(heights_mm)), basket.n_columns)
+        return heights_mm, in_plane_mm, rows_along(basket, size, heights_mm, perimeters(in_plane_mm) / (2 * np.pi))
+
+    low, high = FACTORS
+    if not section(low)[2][-1] < rows < section(high)[2][-1]:
+        raise LandingError(f"{basket.name} {size.label} does not fit this sac. Choose another size.")
+    factor = brentq(lambda one: section(one)[2][-1] - rows, low, high, xtol=1e-5)
+    return section(factor)
 
 
 def measure_basket(anatomy: Anatomy, deployment: Deployment) -> Measures:
@@ -356,7 +370,10 @@ def _advise(anatomy: Anatomy, stent: Stent, gap_mm: Floats) -> str:
         f"{found['sac_axis_height_mm']:.1f} mm"
     )
     if found["protrusion_mm"] > TOLD_MM:
-        lies += f", stands out {found['protrusion_mm']:.1f} mm into the artery (choose a lower size)"
+        lower = [one for one in stent.design.sizes if one.diameter_mm == stent.size.diameter_mm]
+        has_lower = any(one.length_mm < stent.size.length_mm for one in lower)
+        remedy = " (choose a lower size)" if has_lower else ""
+        lies += f", stands out {found['protrusion_mm']:.1f} mm into the artery{remedy}"
     if found["neck_uncovered_fraction"] > 0:
         lies += f", and leaves {found['neck_uncovered_fraction']:.0%} of the neck open (choose a wider size)"
     loose = 1 - found["apposed_fraction"]

@@ -12,6 +12,7 @@ import numpy as np
 from markupsafe import Markup
 from numba import config
 
+from vstent.devices.design import Basket
 from vstent.devices.stent import Deployment
 from vstent.devices.treatment import BARE
 from vstent.flow.settings import LATTICE, OPENFOAM
@@ -248,10 +249,13 @@ def _implant(
     wires = f"{len(stent.wire_diameter_um)} wires or struts of {diameters} µm"
     how = "terminated" if deployment.outcome == "terminated" else "stopped at its iteration limit"
     steps = counted(len(deployment.terminated_fraction), "iteration")
+    words = f"The contour {how} after {steps}, in {deployment.seconds:.2f} s."
+    if isinstance(stent.design, Basket):
+        words = f"As many rows of crossings as outside, in {deployment.seconds:.2f} s."
     facts = [(Quantity((f.name,), None).name, f"{f.confidence}: {f.source}") for f in stent.design.facts]
     return {
         "title": title,
-        "words": f"{wires}. The contour {how} after {steps}, in {deployment.seconds:.2f} s.",
+        "words": f"{wires}. {words}",
         "advice": deployment.advice,
         "quantities": flatten({key: value for key, value in measured.items() if key != "bands"}, path),
         "how_sure": how_sure(measured, is_repeated=is_repeated),
