@@ -46,17 +46,17 @@ def table(titles: list[str], rows: list[list[str]], widths: str = "auto") -> str
 
 def devices() -> str:
     """Return one section a device: drawing, every number with its source and confidence; and a count of these."""
-    from vstent.devices.catalogue import catalogue
-    from vstent.devices.design import Braid
+    from vstent.devices.catalogue import baskets, catalogue
+    from vstent.devices.design import Basket, Braid
 
-    designs = catalogue()
+    designs = catalogue() | baskets()
     sure = Counter(fact.confidence for design in designs.values() for fact in design.facts)
     total = sum(sure.values())
     text = [f"The catalogue has {len(designs)} devices and {total} sourced entries: "]
     text.append(", ".join(f"{n} {kind}" for kind, n in sorted(sure.items())) + ".\n\n")
     for design in designs.values():
         text.append(f"{design.name}\n{'-' * len(design.name)}\n\n")
-        kind = "braid" if isinstance(design, Braid) else "laser-cut"
+        kind = design.kind.replace("_", "-")
         wires = (
             " and ".join(f"{count} wires of {diameter:g} um" for count, diameter in design.wires)
             if isinstance(design, Braid)
@@ -64,13 +64,8 @@ def devices() -> str:
         )
         text.append(f"``{design.key}``, {design.maker}: {kind}, {wires}, {design.angle_rad:.3f} rad to the axis; ")
         text.append(f"{len(design.sizes)} sizes, {_range(design.sizes)}.{_structure(design)}\n\n")
-        size = _middle_size(design)
-        draw_device(design, size, GENERATED / f"device_{design.key}.png")
-        text.append(f".. figure:: ../generated/device_{design.key}.png\n   :width: 100%\n\n")
-        text.append(
-            f"   {design.name} {size.label}, outside an artery and in an artery of {_artery_mm(design, size):.2f} mm. "
-            "Both drawings have one scale; wires and struts have their own width.\n\n"
-        )
+        if not isinstance(design, Basket):
+            text.append(_drawing(design))
         rows = [[f"``{fact.name}``", fact.confidence, _escaped(fact.source)] for fact in design.facts]
         text.append(table(["number", "confidence", "source"], rows, "20 15 65"))
         rows = [
@@ -79,6 +74,17 @@ def devices() -> str:
         ]
         text.append(table(["number", "value", "range", "confidence", "reason for the range"], rows, "20 10 15 10 45"))
     return "".join(text)
+
+
+def _drawing(design: Any) -> str:
+    """Draw a device and return the figure."""
+    size = _middle_size(design)
+    draw_device(design, size, GENERATED / f"device_{design.key}.png")
+    return (
+        f".. figure:: ../generated/device_{design.key}.png\n   :width: 100%\n\n"
+        f"   {design.name} {size.label}, outside an artery and in an artery of {_artery_mm(design, size):.2f} mm. "
+        "Both drawings have one scale; wires and struts have their own width.\n\n"
+    )
 
 
 def _structure(design: Any) -> str:

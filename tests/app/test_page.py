@@ -431,9 +431,15 @@ def test_of_two_implants_the_inner_opens_in_the_outer_and_is_deployed_again_wher
     assert (told["treatment"], told["implant"]) == ("two", "inner")
     assert told["title"] == "Silk 4 × 15 mm + Silk 4 × 15 mm"
     assert told["length_mm"] == pytest.approx(inner.stent.deployed_length_mm, rel=1e-9)
-    assert [sheet["title"] for sheet in told["measures"]] == ["1. Silk 4 × 15 mm", "2. Silk 4 × 15 mm"]
+    titles = ["1. Silk 4 × 15 mm", "2. Silk 4 × 15 mm", "All devices together"]
+    assert [sheet["title"] for sheet in told["measures"]] == titles
     for found, one in zip(wires_of(told, raw, "two"), (outer, inner), strict=True):
         np.testing.assert_allclose(found, one.stent.wire_points_mm, atol=2e-3)
+    # Dragged, the inner one opens in the outer one too.
+    dragged = wanted(TWO, implant="inner", anchor="proximal", abscissa_mm=told["ends_mm"][0] + 1.0)
+    sketched, _ = app_case.opened(client.post(f"{case}/sketch", json=dragged))
+    there = deploy(silk, anatomy, landing=Landing(sketched["center_mm"]), inside=[outer.stent]).stent
+    assert sketched["ends_mm"] == pytest.approx([there.proximal_abscissa_mm, there.distal_abscissa_mm], abs=0.1)
     # While the outer one is dragged, the inner one stays as it was deployed.
     there_mm = told["ends_mm"][0] - 2.0
     dragged = wanted(TWO, implant="outer", anchor="proximal", abscissa_mm=there_mm)
@@ -450,6 +456,17 @@ def test_of_two_implants_the_inner_opens_in_the_outer_and_is_deployed_again_wher
     assert np.abs(again.stent.wire_points_mm - inner.stent.wire_points_mm).max() > 0.02
     refused = client.post(f"{case}/deployment", json=wanted(TWO, implant="third"))
     assert (refused.status_code, "not among the implants" in refused.json()["detail"]) == (422, True)
+
+
+def test_a_basket_is_left_to_the_command_line(client, case):
+    words = "web_sl is a basket: plan it with vstent run on the command line"
+    for refused in (
+        choose(client, case, treatments=[alone("web_sl")]),
+        client.post(f"{case}/deployment", json=wanted(alone("web_sl"))),
+        client.post(f"{case}/sketch", json=wanted(alone("web_sl"))),
+    ):
+        assert refused.status_code == 422
+        assert words in refused.text
 
 
 def test_a_section_through_two_implants_has_both_and_the_diameters_of_one(client, case):

@@ -47,10 +47,12 @@ def test_the_flows_table_compares_numbers_and_not_how_sure_they_are() -> None:
 
 def test_of_several_implants_every_measure_is_told_in_their_order() -> None:
     inner = DEPLOYED | {"size": "3.0 x 15 mm", "apposed_fraction": 0.5}
-    metrics = {"treatments": {"both": {"implants": {"silk": DEPLOYED, "silk_2": inner}}}}
+    union = {"neck_union_coverage_fraction": 0.417}
+    metrics = {"treatments": {"both": {"implants": {"silk": DEPLOYED, "silk_2": inner}, "together": union}}}
     names, _, both = columns(comparison_table(metrics))
     assert dict(zip(names, both, strict=True))["Size (label)"] == "3.5 x 15 mm + 3.0 x 15 mm"
     assert dict(zip(names, both, strict=True))["Apposed"] == "91.7 % + 50.0 %"
+    assert dict(zip(names, both, strict=True))["Metal on the neck, all devices"] == "41.7 %"
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from vstent.deployment.contour import perimeters
 from vstent.deployment.deploy import deploy
 from vstent.deployment.measure import measure, wire_stretches
 from vstent.deployment.method import Zhong2016
-from vstent.deployment.wall import inner_face
+from vstent.deployment.wall import inner_nodes_mm
 from vstent.devices import catalogue, formulas
 from vstent.devices import design as device
 from vstent.devices.stent import Landing
@@ -211,7 +211,8 @@ def test_a_second_device_lands_on_the_inner_face_of_the_first_where_they_overlap
     # Wires of the two devices do not touch: the inner face keeps the second's outermost wire off.
     points_mm = second.stent.wire_points_mm
     points_mm = points_mm[(points_mm[:, 2] > 33.0) & (points_mm[:, 2] < 37.5)]
-    off_mm = inner_face(first.stent).closest(points_mm)[1]
+    inner = Surface(inner_nodes_mm(first.stent).reshape(-1, 3), first.stent.contour.faces)
+    off_mm = inner.closest(points_mm)[1]
     assert off_mm.min() > 0.5 * 0.03 - 0.002
 
 

@@ -51,3 +51,38 @@ def _on_edge(a, b, p):
 def _is_in_triangle(corners, normals, foot):
     turns = [np.cross(np.roll(corners, -k - 1, axis=1)[:, 0] - corners[:, k], foot - corners[:, k]) for k in range(3)]
     return np.all([np.einsum("ij,ij->i", turn, normals) >= 0 for turn in turns], axis=0)
+
+
+def least_gap_mm(first, second):
+    """The smallest gap between the wires of two devices, of all pairs of their pieces; negative where wires overlap."""
+    a, a_end, a_half = first.pieces_mm
+    b, b_end, b_half = second.pieces_mm
+    middle, reach = 0.5 * (b + b_end), 0.5 * np.linalg.norm(b_end - b, axis=1) + b_half
+    least = np.inf
+    for k in range(len(a)):
+        bound = np.linalg.norm(0.5 * (a[k] + a_end[k]) - middle, axis=1) - 0.5 * np.linalg.norm(a_end[k] - a[k]) - reach
+        near = np.flatnonzero(bound - a_half[k] < min(least, 0.1))  # the others are farther apart than that
+        if len(near):
+            apart = _apart(a[k], a_end[k], b[near], b_end[near]) - a_half[k] - b_half[near]
+            least = min(least, float(apart.min()))
+    return least
+
+
+def _apart(a, a_end, b, b_end):
+    """Distances of a segment from segments (n, 3): the least of their ends, and of lines where they cross."""
+
+    def to_segment(point, start, end):
+        along = end - start
+        t = np.sum((point - start) * along, axis=-1) / np.sum(along * along, axis=-1)
+        return np.linalg.norm(point - start - np.clip(t, 0, 1)[..., None] * along, axis=-1)
+
+    ends = [to_segment(p, b, b_end) for p in (a, a_end)] + [to_segment(p, a, a_end) for p in (b, b_end)]
+    across = np.cross(a_end - a, b_end - b)
+    size = np.sum(across * across, axis=1)
+    is_crossed = size > 1e-20
+    size = np.where(is_crossed, size, 1.0)
+    s = np.sum(np.cross(b - a, b_end - b) * across, axis=1) / size
+    t = np.sum(np.cross(b - a, a_end - a) * across, axis=1) / size
+    is_within = is_crossed & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
+    lines = np.where(is_within, np.abs(np.sum((b - a) * across, axis=1)) / np.sqrt(size), np.inf)
+    return np.min([*ends, lines], axis=0)

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Final, Self, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model, field_validator, model_validator
 
+from vstent.devices.catalogue import baskets
 from vstent.devices.treatment import Treatment
 from vstent.fields import POSITION, Option, check_all
 from vstent.flow.settings import FlowSettings, Numerics
@@ -149,6 +150,8 @@ class Choices(OfVessel):
             if not treatment.implants:
                 raise ValueError("a treatment needs an implant")
             for implant in treatment.implants:
+                if implant.device.casefold() in baskets():
+                    raise ValueError(f"{implant.device} is a basket: plan it with vstent run on the command line")
                 check_all(implant)
         return treatments
 

@@ -23,15 +23,16 @@ from vstent.app.films import films_message, kept_curves
 from vstent.app.finished import kept_histories, shown_flows
 from vstent.app.scans import LOCK
 from vstent.deployment.contour import planes
+from vstent.deployment.coverage import together
 from vstent.deployment.deploy import propose_landing
 from vstent.deployment.measure import measure
 from vstent.deployment.method import laid_inside
 from vstent.deployment.sketch import MeasuredWall, Sketch, measured_wall, sketch
-from vstent.devices.catalogue import find_design
+from vstent.devices.catalogue import baskets, find_design
 from vstent.devices.formulas import coverage_fraction, free_diameters_mm
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.devices.treatment import BARE, Implant, Treatment, with_device
-from vstent.errors import InputError, ReadError, VstentError
+from vstent.errors import DeviceError, InputError, ReadError, VstentError
 from vstent.flow.case import FlowField
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.problem import vessel_case
@@ -128,15 +129,22 @@ class Preview:
                 return treatment
         raise ReadError(f"{name} is not among the chosen treatments.")
 
-    def _wall(self, implant: Implant) -> MeasuredWall:
-        """Return the artery prepared for an implant of the chosen size."""
+    def _wall(self, treatment: Treatment, implant: Implant) -> MeasuredWall:
+        """Return the artery, with the implants inside which it opens, prepared for an implant of the chosen size."""
         path, asked = implant.placing.path, (implant.device, implant.diameter_mm, implant.length_mm)
 
         def prepare() -> MeasuredWall:
             anatomy = on_path(self.anatomy, path)
-            return measured_wall(find_design(implant.device), size_of(implant, anatomy), anatomy)
+            inside = self._outer(treatment, implant)
+            return measured_wall(find_design(implant.device), size_of(implant, anatomy), anatomy, inside)
 
-        return self._cached(("wall", self.case.state.anatomy, path, *asked), prepare)
+        return self._cached(("wall", self.case.state.anatomy, path, *asked, *_before(treatment, implant)), prepare)
+
+    def _outer(self, treatment: Treatment, implant: Implant) -> list[Stent]:
+        """Return the deployed devices inside which an implant opens; a DeviceError says that it is a basket."""
+        if implant.device.casefold() in baskets():
+            raise DeviceError(f"{implant.device} is a basket: plan it with vstent run on the command line.")
+        return [self.deployment(treatment, _implant(treatment, name)).stent for name in implant.inside]
 
     def _of_implant(self, what: str, treatment: Treatment, implant: Implant, compute: Callable[[], Found]) -> Found:
         """Return a cached result of a deployed implant; where there is none, compute and cache it."""
@@ -147,8 +155,7 @@ class Preview:
 
         def deploy() -> Deployment:
             self._ask(treatment)
-            inside = [self.deployment(treatment, _implant(treatment, name)).stent for name in implant.inside]
-            return deploy_implant(implant, self.anatomy, inside)
+            return deploy_implant(implant, self.anatomy, self._outer(treatment, implant))
 
         return self._of_implant("deployment", treatment, implant, deploy)
 
@@ -198,7 +205,12 @@ class Preview:
     def _sheets(self, treatment: Treatment) -> list[dict[str, Any]]:
         """Return the tables of the deployed implants of a treatment."""
         titles = implant_titles(self.deployed(treatment))
-        return [sheets.device(titles[one.id], self._measures(treatment, one)) for one in treatment.implants]
+        found = [sheets.device(titles[one.id], self._measures(treatment, one)) for one in treatment.implants]
+        if len(found) > 1:
+            key = "together", self.case.state.anatomy, treatment.implants
+            measures = self._cached(key, lambda: together(self.anatomy, self.stents(treatment)))
+            found.append(sheets.device("All devices together", measures))
+        return found
 
     def bands_sheet(self, treatment: Treatment, implant: str, *, has_gaps: bool = False) -> dict[str, Any]:
         """Return the bands of a deployed implant as the page shows them; those of gaps take some seconds."""
@@ -330,13 +342,13 @@ class Preview:
     def sketch_message(self, treatment: Treatment, implant: str, landing: Landing | None, colour: Colour) -> bytes:
         """Return the wires of an implant at its expected position, with the others of its treatment as deployed.
 
-        The implant is drawn as if it opened against the wall of the artery, at a landing; None: at the chosen one, or
-        at the proposed one where none is chosen.
+        The implant opens against the artery and the implants that it is inside of, at a landing; None: at the chosen
+        one, or at the proposed one where none is chosen.
         """
         self._ask(treatment)
         with LOCK:
             pane, chosen = treatment.name, _implant(treatment, implant)
-            wall, anatomy = self._wall(chosen), on_path(self.anatomy, chosen.placing.path)
+            wall, anatomy = self._wall(treatment, chosen), on_path(self.anatomy, chosen.placing.path)
             landing = landing or landing_of(chosen, anatomy, wall.size)
             if landing is None:
                 found = laid_inside(partial(sketch, wall), propose_landing(wall.design, anatomy, wall.size))
@@ -357,7 +369,9 @@ class Preview:
             self._show(self.stents(treatment))
             layers = self._drawn(treatment.name, treatment, colour)
             landing = landing_of(chosen, on_path(self.anatomy, chosen.placing.path), stent.size)
-            found = laid_inside(partial(sketch, self._wall(chosen)), landing or Landing(stent.middle_abscissa_mm))
+            found = laid_inside(
+                partial(sketch, self._wall(treatment, chosen)), landing or Landing(stent.middle_abscissa_mm)
+            )
             return message(
                 layers,
                 scales_of(layers, self.anatomy),

@@ -28,6 +28,8 @@ FIRST: Final = {
         "deployed_length_mm",
         "neck_covered_fraction",
         "neck_metal_coverage_fraction",
+        "neck_union_coverage_fraction",
+        "overlap_length_mm",
         "apposed_fraction",
         "max_wall_gap_mm",
         "neck_to_proximal_end_mm",

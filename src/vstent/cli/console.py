@@ -56,10 +56,15 @@ DEVICE_ROWS: Final = (
     ("Deployed length", "deployed_length_mm"),
     ("Apposed", "apposed_fraction"),
     ("Metal coverage over the neck", "neck_metal_coverage_fraction"),
+    ("Basket, height", "basket_height_mm"),
+    ("Basket, stands out into the artery", "protrusion_mm"),
+    ("Basket, neck left open", "neck_uncovered_fraction"),
 )
 """Rows of the comparison of deployments: title and key of the measure."""
 
 
+NECK_UNION: Final = "neck_union_coverage_fraction"
+"""Key of the metal coverage of the neck by all devices of a treatment."""
 QUIET_S: Final = 30.0
 """Time between progress lines where the output is not a terminal, in s."""
 
@@ -127,11 +132,15 @@ def comparison_table(metrics: Mapping[str, Any]) -> Table:
             " + ".join(
                 f"{_cell(key, implant.get(key))} {_spaced(ends(implant, key))}".rstrip()
                 for implant in treatment["implants"].values()
+                if key in implant
             )
             for treatment in treatments.values()
         ]
         if any(cells):
             table.add_row(title, "", *cells)
+    unions = [treatment.get("together", {}).get(NECK_UNION) for treatment in treatments.values()]
+    if any(union is not None for union in unions):
+        table.add_row("Metal on the neck, all devices", "", *(_cell(NECK_UNION, union) for union in unions))
     if bare:
         table.add_section()
         _add_flow_rows(table, metrics, {key: title for title, key in ROWS})

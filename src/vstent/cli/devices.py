@@ -37,9 +37,12 @@ def add(commands: options.Commands) -> None:
 def _devices(arguments: argparse.Namespace) -> int:
     """Print the catalogue; return the exit code."""
     from vstent.cli.console import Console, device_table
-    from vstent.devices.catalogue import catalogue
+    from vstent.devices.catalogue import baskets, catalogue
 
-    Console().print(device_table(catalogue()))
+    console = Console()
+    console.print(device_table(catalogue()))
+    console.print("Baskets for the sac; sizes are width x height:")
+    console.print(device_table(baskets()))
     return 0
 
 

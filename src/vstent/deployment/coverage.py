@@ -1,5 +1,6 @@
 """Metal coverage and pores of a deployed device, measured on its drawn wires."""
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Final
 
@@ -13,7 +14,6 @@ from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Bools, Floats, Ints
-from vstent.units import MM_PER_UM
 
 NECK_TOLERANCE_MM: Final = 0.02
 """Largest distance between the neck and the landing surface, in mm, since the two have different triangles."""
@@ -30,10 +30,13 @@ def coverage_fractions(stent: Stent) -> Floats:
     """Return the fraction (rows - 1, columns) of every quad of the contour that metal covers, seen along its normal."""
     from vstent.kernels.coverage import covered_fractions  # compiles on first use
 
-    here = stent.piece_starts
-    radius_mm = 0.5 * stent.wire_diameter_um[stent.point_wires[here]] * MM_PER_UM
-    points_mm = stent.wire_points_mm
-    return covered_fractions(stent.nodes_mm, points_mm[here], points_mm[here + 1], radius_mm, SAMPLES_PER_QUAD)
+    return covered_fractions(stent.nodes_mm, *stent.pieces_mm, SAMPLES_PER_QUAD)
+
+
+def quad_middles_mm(nodes_mm: Floats) -> Floats:
+    """Return the middles (rows - 1, columns, 3) of the quads of a contour (rows, columns, 3)."""
+    along_mm = 0.25 * (nodes_mm[1:] + nodes_mm[:-1])
+    return along_mm + np.roll(along_mm, -1, axis=1)
 
 
 def pore_places(stent: Stent) -> tuple[Ints, Ints]:
@@ -82,14 +85,40 @@ def density(anatomy: Anatomy, stent: Stent) -> Measures:
     if len(pores_mm):
         found["pore_density_per_mm2"] = float(pores.sum() / pore_mm2.sum())
     if anatomy.aneurysms:
-        quads_mm = 0.25 * (stent.nodes_mm[1:] + stent.nodes_mm[:-1])
-        quads_mm = quads_mm + np.roll(quads_mm, -1, axis=1)
-        on_neck = is_over_neck(anatomy, quads_mm.reshape(-1, 3)).reshape(covered.shape)
+        on_neck = is_over_neck(anatomy, quad_middles_mm(stent.nodes_mm).reshape(-1, 3)).reshape(covered.shape)
         if on_neck.any():
             found["neck_metal_coverage_fraction"] = float(np.average(covered[on_neck], weights=quad_mm2[on_neck]))
         on_neck = is_over_neck(anatomy, pores_mm)
         if on_neck.any():
             found["neck_pore_density_per_mm2"] = float(pores[on_neck].sum() / pore_mm2[on_neck].sum())
+    return found
+
+
+def together(anatomy: Anatomy, stents: Sequence[Stent]) -> Measures:
+    """Measure several devices of one treatment as a whole, on the parent artery.
+
+    Metal over the neck is what is under a wire of any of them, as a fraction of the whole neck.
+    """
+    from vstent.kernels.coverage import covered_fractions  # compiles on first use
+
+    meshes_mm = sorted(stent.mesh_abscissa_mm for stent in stents)
+    edges_mm = np.unique(meshes_mm)
+    middles_mm, lengths_mm = 0.5 * (edges_mm[1:] + edges_mm[:-1]), np.diff(edges_mm)
+    layers = sum((middles_mm > first_mm) & (middles_mm < last_mm) for first_mm, last_mm in meshes_mm)
+    found: Measures = {
+        "covered_length_mm": float(lengths_mm[layers > 0].sum()),
+        "overlap_length_mm": float(lengths_mm[layers > 1].sum()),
+    }
+    if anatomy.aneurysms:
+        nodes_mm = anatomy.parent.landing_surface.vertices_mm.reshape(len(anatomy.parent.axis.points_mm), -1, 3)
+        starts_mm, ends_mm, half_mm = (
+            np.concatenate(part) for part in zip(*(s.pieces_mm for s in stents), strict=True)
+        )
+        covered = covered_fractions(nodes_mm, starts_mm, ends_mm, half_mm, SAMPLES_PER_QUAD)
+        areas_mm2 = anatomy.parent.landing_surface.areas_mm2.reshape(2, *covered.shape).sum(axis=0)
+        on_neck = is_over_neck(anatomy, quad_middles_mm(nodes_mm).reshape(-1, 3)).reshape(covered.shape)
+        if on_neck.any():
+            found["neck_union_coverage_fraction"] = float(np.average(covered[on_neck], weights=areas_mm2[on_neck]))
     return found
 
 

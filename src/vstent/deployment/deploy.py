@@ -8,15 +8,18 @@ import numpy as np
 
 from vstent.deployment import sizing, wires
 from vstent.deployment.advice import advise
+from vstent.deployment.basket import deploy_basket
 from vstent.deployment.braid import ConstantWire
 from vstent.deployment.method import AbstractMethod, Course, Placement, Progress, Zhong2016, laid_inside, run
+from vstent.deployment.nested import kept_inside
 from vstent.deployment.wall import landing_wall
 from vstent.devices.catalogue import find_design
-from vstent.devices.design import Design, Size
+from vstent.devices.design import Basket, Design, Size
 from vstent.devices.formulas import compacted
 from vstent.devices.stent import Deployment, Landing, Stent
-from vstent.errors import InputError
+from vstent.errors import InputError, LandingError
 from vstent.geometry.vessel import Anatomy
+from vstent.kernels.arrays import Floats
 from vstent.units import MM_PER_UM
 
 METHODS: dict[str, type[ConstantWire] | type[Zhong2016]] = {"constant_wire": ConstantWire, "zhong2016": Zhong2016}
@@ -38,7 +41,7 @@ def deploy(
     inside: Sequence[Stent] = (),
     progress: Progress | None = None,
 ) -> Deployment:
-    """Deploy a device in the parent artery.
+    """Deploy a device in the parent artery, or a basket in the largest sac.
 
     Parameters
     ----------
@@ -50,7 +53,8 @@ def deploy(
         Size of the device; None proposes one.
     landing : Landing, optional
         Where the center, the proximal or the distal end lies. None centers the device on the neck of the largest
-        aneurysm, or as near to it as the ends of the artery allow.
+        aneurysm, or as near to it as the ends of the artery allow. A basket is landed with its proximal end, at a
+        height above the middle of the neck; None is 0.
     method : AbstractMethod or str, optional
         ``constant_wire``, ``zhong2016`` (the contour of the paper alone), or a method with other weights.
     compaction_fraction : float, optional
@@ -81,6 +85,10 @@ def deploy(
     """
     began = time.perf_counter()
     design = find_design(design) if isinstance(design, str) else design
+    if isinstance(design, Basket):
+        if inside:
+            raise LandingError(f"{design.name} lies in a sac alone: give it a treatment of its own.")
+        return deploy_basket(design, anatomy, size, landing or Landing(0.0, "proximal"))
     if isinstance(method, str):
         if method not in METHODS:
             raise InputError(f"There is no deployment method called {method!r}. Choose one of {', '.join(METHODS)}.")
@@ -95,9 +103,13 @@ def deploy(
 
     course = laid_inside(opened_at, propose_landing(design, anatomy, size)) if landing is None else opened_at(landing)
     nodes_mm, crowns = course.opened.contour.nodes_mm, course.opened.crowns
-    drawn = wires.draw(design, size, nodes_mm, wall, crowns)
-    stent = Stent(design, size, nodes_mm, course.opened.abscissa_mm, *drawn, crowns.shift_mm)
-    contact = wall.contact(nodes_mm.reshape(-1, 3))
+
+    def drawn(nodes_mm: Floats) -> Stent:
+        found = wires.draw(design, size, nodes_mm, wall, crowns)
+        return Stent(design, size, nodes_mm, course.opened.abscissa_mm, *found, crowns.shift_mm)
+
+    stent = kept_inside(drawn(nodes_mm), drawn, inside, anatomy.parent.landing_surface)
+    contact = wall.contact(stent.nodes_mm.reshape(-1, 3))
     gap_mm = np.maximum(contact.distance_mm - dd_mm, 0.0).reshape(nodes_mm.shape[:2])
     return Deployment(
         stent=stent,

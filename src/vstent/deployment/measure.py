@@ -6,11 +6,12 @@ import numpy as np
 
 from vstent.anatomy.landing_zones import neck_points_mm, neck_span_mm
 from vstent.anatomy.morphology import Measures
+from vstent.deployment.basket import measure_basket
 from vstent.deployment.coverage import density, quad_areas_mm2
 from vstent.deployment.crowns import free_crowns
 from vstent.deployment.crumpling import crumpling_measures
 from vstent.deployment.sizing import APPOSED_GAP_MM, oversizing_fraction
-from vstent.devices.design import piece_length_mm
+from vstent.devices.design import Basket, piece_length_mm
 from vstent.devices.formulas import grid
 from vstent.devices.stent import Deployment, Stent
 from vstent.geometry.vessel import Anatomy
@@ -42,11 +43,14 @@ def measure(anatomy: Anatomy, deployment: Deployment) -> Measures:
     """
     stretch = wire_stretches(deployment.stent)
     p95 = float(np.quantile(np.abs(stretch), 0.95))
+    stretches = {"mean_wire_stretch_fraction": float(stretch.mean()), "p95_wire_stretch_fraction": p95}
+    if isinstance(deployment.stent.design, Basket):
+        return measure_basket(anatomy, deployment) | stretches
     return (
         _position(anatomy, deployment.stent)
         | apposition(anatomy, deployment)
         | density(anatomy, deployment.stent)
-        | {"mean_wire_stretch_fraction": float(stretch.mean()), "p95_wire_stretch_fraction": p95}
+        | stretches
         | crumpling_measures(anatomy, deployment.stent)
         | _free_crowns(anatomy, deployment.stent)
         | _branches(anatomy, deployment.stent)

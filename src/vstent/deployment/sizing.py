@@ -16,9 +16,10 @@ from typing import Final
 import numpy as np
 
 from vstent.anatomy.landing_zones import landing_diameters_mm, neck_span_mm
+from vstent.deployment.basket import propose_basket
 from vstent.deployment.braid import expected_profile, march
 from vstent.deployment.sketch import measured_wall
-from vstent.devices.design import Design, Size
+from vstent.devices.design import Basket, Design, Size
 from vstent.devices.formulas import mesh_nodes
 from vstent.devices.stent import Landing, Stent
 from vstent.errors import LandingError
@@ -59,8 +60,11 @@ def oversizing_fraction(anatomy: Anatomy, stent: Stent) -> float:
 def propose_size(design: Design, anatomy: Anatomy) -> Size:
     """Propose the size of a device for the largest aneurysm, narrower where the artery is too short for a wider one.
 
-    A LandingError says that all sizes that are not too wide for the artery are too long for it.
+    A LandingError says that all sizes that are not too wide for the artery are too long for it, or that the neck is
+    wider than any basket.
     """
+    if isinstance(design, Basket):
+        return propose_basket(design, anatomy)
     wider_mm = max(landing_diameters_mm(anatomy))
     labels = sorted({size.diameter_mm for size in design.sizes})
     zone = next((i for i, label in enumerate(labels) if label >= wider_mm - DIAMETER_SLACK_MM), len(labels) - 1)

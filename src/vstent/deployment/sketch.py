@@ -6,6 +6,7 @@ slides the crossings and draws the wires. Unlike `vstent.deployment.deploy.deplo
 wall again after the crossings have moved, and it does not recompute the row positions from the deployed diameters.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
@@ -16,6 +17,7 @@ from vstent.deployment import cells, pieces
 from vstent.deployment.braid import Profile, expected_profile, grown, landed_row, march, over_openings
 from vstent.deployment.contour import Planes, circles, evenly_spaced, perimeters, planes
 from vstent.deployment.method import check_inside, check_landing
+from vstent.deployment.wall import landing_wall
 from vstent.deployment.wires import draw
 from vstent.devices.design import Design, Size, widest_mm
 from vstent.devices.formulas import free_diameters_mm, grid
@@ -75,8 +77,12 @@ class Sketch:
     """Arc lengths of the distal end, in mm, for the smallest and the largest plausible diameters of the artery."""
 
 
-def measured_wall(design: Design, size: Size, anatomy: Anatomy) -> MeasuredWall:
-    """Measure the wall of an artery for a device, independent of where the device is landed."""
+def measured_wall(design: Design, size: Size, anatomy: Anatomy, inside: Sequence[Stent] = ()) -> MeasuredWall:
+    """Measure the wall of an artery for a device, independent of where the device is landed.
+
+    Where devices are already in the artery, it is the inner face of the last of them.
+    """
+    surface = landing_wall(anatomy, inside)[0].surface
     axis, columns = anatomy.parent.axis, grid(design, size).columns
     across = planes(axis)
     abscissa_mm = np.linspace(0.0, axis.length_mm, max(8, round(axis.length_mm / STEP_MM) + 1))
@@ -86,14 +92,14 @@ def measured_wall(design: Design, size: Size, anatomy: Anatomy) -> MeasuredWall:
     centers_mm, frames = across.at(abscissa_mm)
     rays = circles(np.ones(len(abscissa_mm)), columns) @ frames[:, 1:]
     origins_mm = np.repeat(centers_mm, columns, axis=0)
-    reach_mm = anatomy.parent.landing_surface.first_hit(origins_mm, rays.reshape(-1, 3)).reshape(-1, columns)
+    reach_mm = surface.first_hit(origins_mm, rays.reshape(-1, 3)).reshape(-1, columns)
     # Rays that leave through an end of the artery or run along a bend do not measure the wall.
     section_mm = np.interp(abscissa_mm, axis.abscissa_mm, anatomy.parent.section_radius_mm)[:, None]
     reach_mm = np.where(reach_mm < 1.6 * section_mm, reach_mm, section_mm)
     outer = np.maximum(reach_mm - dd_mm, 0.1)[..., None] * circles(np.ones(len(abscissa_mm)), columns)
     in_plane_mm = evenly_spaced(grown(inner, outer, np.full(len(inner), widest_mm(design, size)))[0])
     nodes_mm = across.place(abscissa_mm, in_plane_mm).reshape(-1, 3)
-    gap_mm = np.maximum(anatomy.parent.landing_surface.closest(nodes_mm)[1] - dd_mm, 0.0).reshape(-1, columns)
+    gap_mm = np.maximum(surface.closest(nodes_mm)[1] - dd_mm, 0.0).reshape(-1, columns)
     band_mm = anatomy.vessel.threshold_band_mm or ASSUMED_BAND_MM
     is_opening = over_openings(anatomy, nodes_mm).reshape(gap_mm.shape)
     expected = expected_profile(design, size, anatomy)

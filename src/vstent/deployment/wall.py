@@ -6,17 +6,26 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple, final
 
 import numpy as np
+from scipy.ndimage import maximum_filter
+from scipy.spatial import cKDTree
 
 from vstent.deployment.contour import normals
-from vstent.devices.stent import Stent
+from vstent.devices.design import Braid
+from vstent.devices.formulas import grid
+from vstent.devices.stent import Stent, tube_faces
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels import curves
 from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.units import MM_PER_UM
 
-OVERLAP_MM: Final = 0.5
-"""Length, in mm, by which the artery's wall is kept inside each end of a device that is already in it."""
+RAMP_MM: Final = 0.6
+"""Length, in mm, of the ramp from an end of a device to the wall around it, for a device that opens inside.
+
+Wires do not follow a sharper step: with a shorter ramp those of the second device pass through the end of the first.
+"""
+SEAM_MM: Final = 0.4
+"""Length, in mm, by which a ramp goes on along the wall, which ends in whole triangles at the foot of the ramp."""
 ON_WALL_MM: Final = 1e-9
 """Distance, in mm, below which a point lies on the wall, so that the direction to its closest point is undefined."""
 
@@ -80,26 +89,56 @@ class TreeWall(AbstractWall):
         return self.surface.crosses(starts_mm, ends_mm)
 
 
-def landing_wall(anatomy: Anatomy, inside: Sequence[Stent] = ()) -> tuple[AbstractWall, Bools]:
-    """Build the wall against which a device opens.
+def landing_wall(anatomy: Anatomy, inside: Sequence[Stent] = ()) -> tuple[TreeWall, Bools]:
+    """Build the wall against which a device opens, and say which triangles of it are the patient's own.
 
-    It is the landing surface. Where devices are already deployed, it is the inner face of the last of them instead.
+    It is the landing surface. Where devices are already deployed, it is the inner face of the last of them instead, and
+    a ramp from its ends to the wall around them.
     """
     surface = anatomy.parent.landing_surface
     is_patient = anatomy.parent.is_patient_face
     for stent in inside:
-        foot_mm = curves.project(anatomy.parent.axis.points_mm, surface.corners_mm.mean(axis=1))[0]
-        first_mm, last_mm = stent.proximal_abscissa_mm + OVERLAP_MM, stent.distal_abscissa_mm - OVERLAP_MM
-        is_open = (foot_mm < first_mm) | (foot_mm > last_mm)
-        inner, faces = inner_face(stent), surface.faces[is_open]
-        beyond = np.int32(len(surface.vertices_mm))
-        vertices_mm = np.concatenate([surface.vertices_mm, inner.vertices_mm])
-        surface = Surface(vertices_mm, np.concatenate([faces, inner.faces + beyond]))
-        is_patient = np.concatenate([is_patient[is_open], np.zeros(len(inner.faces), dtype=bool)])
+        rings_mm = _ramped(inner_nodes_mm(stent), surface)
+        place_mm = curves.project(anatomy.parent.axis.points_mm, surface.corners_mm.mean(axis=1))[0]
+        reach_mm = RAMP_MM + SEAM_MM + 0.5 * stent.row_diameter_mm.max()
+        is_open = (place_mm < stent.proximal_abscissa_mm - reach_mm) | (place_mm > stent.distal_abscissa_mm + reach_mm)
+        for foot_mm, beyond_mm in ((rings_mm[1], rings_mm[0]), (rings_mm[-2], rings_mm[-1])):
+            nearest = cKDTree(foot_mm).query(surface.vertices_mm)[1]
+            off_mm, along_mm = surface.vertices_mm - foot_mm[nearest], (beyond_mm - foot_mm)[nearest]
+            is_open |= (np.einsum("ij,ij->i", off_mm, along_mm) > 0)[surface.faces].all(axis=1)
+        faces = tube_faces(*rings_mm.shape[:2]) + np.int32(len(surface.vertices_mm))
+        vertices_mm = np.concatenate([surface.vertices_mm, rings_mm.reshape(-1, 3)])
+        surface = Surface(vertices_mm, np.concatenate([surface.faces[is_open], faces]))
+        is_patient = np.concatenate([is_patient[is_open], np.zeros(len(faces), dtype=bool)])
     return TreeWall(surface), is_patient
 
 
-def inner_face(stent: Stent) -> Surface:
-    """Return the inner face of a device: its contour moved inward by the thickness of its mesh."""
-    nodes_mm = stent.nodes_mm - stent.design.mesh_offset_um * MM_PER_UM * normals(stent.nodes_mm)
-    return Surface(nodes_mm.reshape(-1, 3), stent.contour.faces)
+def _ramped(nodes_mm: Floats, wall: Surface) -> Floats:
+    """Return the inner face (rows, columns, 3) of a device, with a ramp and a seam on the wall at each end."""
+    rings_mm = [nodes_mm]
+    for end, before in ((0, 1), (-1, -2)):
+        along = nodes_mm[end] - nodes_mm[before]
+        along = along / curves.lengths(along)[:, None]
+        added_mm = [wall.closest(nodes_mm[end] + by_mm * along)[0][None] for by_mm in (RAMP_MM, RAMP_MM + SEAM_MM)]
+        rings_mm = [*added_mm[::-1], *rings_mm] if end == 0 else [*rings_mm, *added_mm]
+    return np.concatenate(rings_mm)
+
+
+def inner_nodes_mm(stent: Stent) -> Floats:
+    """Return the inner face (rows, columns, 3) of a device on the nodes of its contour.
+
+    The contour runs through the middle of a braid, one wire from its inner face, and along the inner face of struts,
+    whose free crowns may point further inward.
+    """
+    outward = normals(stent.nodes_mm)
+    if isinstance(stent.design, Braid):
+        return stent.nodes_mm - stent.design.mesh_offset_um * MM_PER_UM * outward
+    depth_mm = np.zeros(stent.nodes_mm.shape[:2])
+    if stent.crown_shift_mm.size:
+        shape = grid(stent.design, stent.size)
+        of_crowns = np.s_[:: shape.row_split, :: shape.column_split]
+        inward_mm = -np.einsum("krcd,rcd->krc", stent.crown_shift_mm, outward[of_crowns])
+        depth_mm[of_crowns] = np.maximum(inward_mm.max(axis=0), 0.0)
+        around = 2 * shape.row_split + 1, 2 * shape.column_split + 1
+        depth_mm = maximum_filter(depth_mm, around, mode=("nearest", "wrap"))
+    return np.asarray(stent.nodes_mm - depth_mm[..., None] * outward)

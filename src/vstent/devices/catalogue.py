@@ -13,7 +13,7 @@ from vstent.errors import DeviceError
 
 @cache
 def catalogue() -> dict[str, Design]:
-    """Read all devices: those of the catalogue, of plug-ins and those added by the user.
+    """Read all devices for arteries: those of the catalogue, of plug-ins and those added by the user.
 
     Returns
     -------
@@ -44,6 +44,16 @@ def catalogue() -> dict[str, Design]:
     return designs
 
 
+@cache
+def baskets() -> dict[str, Design]:
+    """Read the baskets for sacs, by their key."""
+    from importlib.resources import files
+
+    from vstent.devices.schema import parse
+
+    return parse(files("vstent.devices").joinpath("baskets.toml").read_text(encoding="utf-8"), "The list of baskets")
+
+
 def user_folder() -> Path:
     """Return the folder of the user's device files: ``vstent/devices`` in ``$XDG_CONFIG_HOME`` or ``~/.config``."""
     home = os.environ.get("XDG_CONFIG_HOME") or os.environ.get("APPDATA") or "~/.config"
@@ -61,7 +71,8 @@ def add_devices(path: Path) -> dict[str, Design]:
     text = _text(path)
     added, kept = parse(text, str(path)), user_folder() / f"{path.stem}.toml"
     others = parse(_text(kept), str(kept)) if kept.exists() else {}
-    _check_new(added, {key: design for key, design in catalogue().items() if key not in others}, path)
+    known = catalogue() | baskets()
+    _check_new(added, {key: design for key, design in known.items() if key not in others}, path)
     kept.parent.mkdir(parents=True, exist_ok=True)
     partial = kept.with_suffix(".partial")
     partial.write_text(text, encoding="utf-8")
@@ -107,7 +118,7 @@ def find_design(name: str) -> Design:
     DeviceError
         There is no such device. The message lists all devices and suggests the most similar name.
     """
-    designs = catalogue()
+    designs = catalogue() | baskets()
     by_name = {word: design for design in designs.values() for word in called([design])}
     wanted = name.strip().casefold()
     if wanted in by_name:

@@ -124,7 +124,7 @@ class Braid:
     """Outer layer of a dual-layer device, or radiopaque strands beside the wires of the mesh."""
     has_closed_ends: bool = False
     """Whether the wires turn back in loops at both ends, as in a braid of a single wire."""
-    kind: Literal["braid"] = field(default="braid", init=False)
+    kind: Literal["braid", "basket"] = field(default="braid", init=False)
     """Device family."""
 
     follows_bends = True
@@ -243,6 +243,24 @@ class Braid:
             for name, one in zip(self.strand_names, self.strands, strict=True)
         )
         return replace(self, wires=wires, braid_angle_rad=new["braid_angle_rad"], strands=strands, sizes=sizes)
+
+
+@dataclass(frozen=True, eq=False)
+class Basket(Braid):
+    """A braid that is closed at both ends by a marker, for the inside of a sac; its sizes are widths x heights.
+
+    The free device is a body of revolution with the section |2 r / W|^p + |2 z / H|^p = 1 of a superellipse, for the
+    width W, the height H and the exponent p. The angle of the braid is that at its widest row.
+    """
+
+    exponent: float = 2.0
+    """Exponent p of the section: 2 of an ellipse, more of a barrel with flat ends."""
+    kind: Literal["braid", "basket"] = field(default="basket", init=False)
+
+    @property
+    def marker_radius_mm(self) -> float:
+        """Radius within which the wires of one hand would lie side by side, in mm; the marker holds them there."""
+        return self.hand_um * MM_PER_UM / (2 * np.pi)
 
 
 @dataclass(frozen=True, eq=False)

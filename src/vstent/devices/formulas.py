@@ -7,6 +7,7 @@ import numpy as np
 
 from vstent.devices.design import (
     STEEP_RAD,
+    Basket,
     Design,
     Size,
     angle_rad,
@@ -24,6 +25,8 @@ STEEPEST_BEND = 0.9
 """Largest ratio of the artery's radius to the radius of its bend. Sharper bends occur only where the wall is folded."""
 STRAIGHTEST = 0.995
 """Largest cosine of the angle between the axis and the wires on the outer side of a bend."""
+MERIDIAN_SAMPLES = 401
+"""Number of samples of a quarter of the section of a free basket."""
 NODE_SPACING_LIMIT_MM = 0.35
 """Largest distance between nodes of a contour at the label diameter, in mm."""
 
@@ -54,10 +57,36 @@ class Grid(NamedTuple):
 def grid(design: Design, size: Size) -> Grid:
     """Return the grid of the contour: one node per lattice row and column, more where cells are large."""
     spacing_mm = float(row_spacing_mm(design, size, size.diameter_mm))
+    if isinstance(design, Basket):
+        return Grid(round(rows_along(design, size, *meridian_mm(design, size))[-1]) + 1, design.n_columns, 1, 1)
     rows = max(2, round(size.compacted_length_mm / spacing_mm) + 1) + 2 * _bare_rows(design, size)
     row_split = int(np.ceil(spacing_mm / NODE_SPACING_LIMIT_MM))
     column_split = int(np.ceil(np.pi * size.diameter_mm / design.n_columns / NODE_SPACING_LIMIT_MM))
     return Grid((rows - 1) * row_split + 1, design.n_columns * column_split, row_split, column_split)
+
+
+def meridian_mm(basket: Basket, size: Size) -> tuple[np.ndarray, np.ndarray]:
+    """Return heights (m,) and radii (m,) along the meridian of a free basket, from marker to marker, in mm."""
+    quarter = 0.5 - 0.5 * np.cos(np.pi * np.linspace(0.0, 1.0, MERIDIAN_SAMPLES))  # dense where it turns
+    angle = 0.5 * np.pi * np.concatenate([quarter, 1 + quarter[1:]])
+    power = 2 / basket.exponent
+    radius_mm = 0.5 * size.free_diameter_mm * np.sin(angle) ** power
+    height_mm = 0.5 * size.length_mm * (1 - np.sign(np.cos(angle)) * np.abs(np.cos(angle)) ** power)
+    is_mesh = radius_mm >= basket.marker_radius_mm
+    return height_mm[is_mesh], radius_mm[is_mesh]
+
+
+def rows_along(basket: Basket, size: Size, height_mm: np.ndarray, radius_mm: np.ndarray) -> np.ndarray:
+    """Return the number (m,) of rows of crossings up to every point of a meridian, heights (m,) and radii (m,) in mm.
+
+    A piece of wire of length l spans one column, 2 pi r / n, around the basket, and rows are sqrt(l^2 - (2 pi r / n)^2)
+    apart along the meridian. On a sphere, r = R sin(t), all rows are (2 R / l) K(m), with the complete elliptic
+    integral K and the square m of the sine of the wires' angle at the equator.
+    """
+    column_mm = 2 * np.pi * radius_mm / basket.n_columns
+    per_mm = 1 / np.sqrt(np.maximum(piece_length_mm(basket, size) ** 2 - column_mm**2, 1e-12))
+    step_mm = np.hypot(np.diff(height_mm), np.diff(radius_mm))
+    return np.concatenate([[0.0], np.cumsum(0.5 * (per_mm[1:] + per_mm[:-1]) * step_mm)])
 
 
 def _bare_rows(design: Design, size: Size) -> int:

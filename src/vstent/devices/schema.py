@@ -7,7 +7,7 @@ from typing import Annotated, Any, Final, Generic, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from vstent.devices.design import Braid, Confidence, Design, Fact, LaserCut, Range, Size, Strands, called, nth
+from vstent.devices.design import Basket, Braid, Confidence, Design, Fact, LaserCut, Range, Size, Strands, called, nth
 from vstent.devices.ranges import LENGTH
 from vstent.devices.treatment import BARE
 from vstent.errors import DeviceError
@@ -248,6 +248,19 @@ class _Braid(_Device):
         )
 
 
+class _Basket(_Braid):
+    """Entry of a closed braid for the inside of a sac; the lengths of its sizes are heights."""
+
+    kind: Literal["basket"]  # type: ignore[assignment]
+    exponent: _Stated[_Positive]
+
+    def design(self) -> Design:
+        """Return the basket."""
+        wires = tuple((group.count.value, group.diameter_um.value) for group in self.wires)
+        angle_rad, exponent = self.braid_angle_rad.value, self.exponent.value
+        return Basket(wires=wires, braid_angle_rad=angle_rad, exponent=exponent, **self.shared())
+
+
 class _LaserCut(_Device):
     """Entry of a laser-cut device."""
 
@@ -284,7 +297,7 @@ class _LaserCut(_Device):
 class _Catalogue(_Strict):
     """Content of a catalogue file."""
 
-    device: list[Annotated[_Braid | _LaserCut, Field(discriminator="kind")]]
+    device: list[Annotated[_Braid | _Basket | _LaserCut, Field(discriminator="kind")]]
 
 
 def parse(text: str, name: str = "The device catalogue") -> dict[str, Design]:

@@ -13,6 +13,7 @@ from vstent.errors import LandingError
 from vstent.geometry.surface import Surface
 from vstent.kernels import curves
 from vstent.kernels.arrays import Floats, Ints, freeze
+from vstent.units import MM_PER_UM
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +79,13 @@ class Stent:
         is_last = np.zeros(len(self.wire_points_mm), dtype=bool)
         is_last[self.wire_starts[1:] - 1] = True
         return np.flatnonzero(~is_last)
+
+    @property
+    def pieces_mm(self) -> tuple[Floats, Floats, Floats]:
+        """First and last points (m, 3) and half the widths (m,) of all straight pieces of wire, in mm."""
+        here, points_mm = self.piece_starts, self.wire_points_mm
+        half_mm = 0.5 * self.wire_diameter_um[self.point_wires[here]] * MM_PER_UM
+        return points_mm[here], points_mm[here + 1], half_mm
 
     @property
     def wire_length_mm(self) -> float:

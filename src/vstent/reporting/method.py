@@ -13,7 +13,7 @@ import numpy as np
 
 from vstent.anatomy.landing_zones import neck_span_mm
 from vstent.deployment.sketch import measured_wall, sketch
-from vstent.devices.design import Design, Size, widest_mm
+from vstent.devices.design import Basket, Design, Size, widest_mm
 from vstent.devices.stent import Deployment, Landing, Stent, tube_faces
 from vstent.devices.treatment import BARE
 from vstent.geometry.surface import Surface
@@ -75,6 +75,10 @@ def method_plates(
     if whole is not None and whole.lumen.areas_mm2.sum() > LARGER * anatomy.vessel.lumen.areas_mm2.sum():
         found.append(_trimming(whole, scene))
     found += [_restoration(scene), _spheres(anatomy, scene)]
+    implants = {
+        name: {key: one for key, one in deployed.items() if not isinstance(one.stent.design, Basket)}
+        for name, deployed in implants.items()
+    }
     deployments = [(title, deployment) for _, _, title, deployment in titled(implants)]
     if deployments:
         stents = {device_title(one): one.stent for _, one in deployments}

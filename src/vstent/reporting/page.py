@@ -12,6 +12,7 @@ import numpy as np
 from markupsafe import Markup
 from numba import config
 
+from vstent.devices.design import Basket
 from vstent.devices.stent import Deployment
 from vstent.devices.treatment import BARE
 from vstent.flow.ends import ASSUMED
@@ -22,7 +23,7 @@ from vstent.reporting.figures import Picture
 from vstent.reporting.packing import pack
 from vstent.reporting.quality import OF_GRADES, Quality, qualities, unusable
 from vstent.reporting.quantities import Change, Quantity, base_of, compare, flatten, opening_rows, unit_of
-from vstent.reporting.scene import Scene, titled
+from vstent.reporting.scene import Scene, titled, treatment_title
 from vstent.reporting.uncertainty import Varied, band_rows, how_sure, uncertainty_of
 from vstent.units import counted
 
@@ -44,7 +45,7 @@ AT_OUTLETS: Final = {
     "windkessel": "the Windkessel downstream of every outlet is assumed, from the mean arterial pressure and its share",
 }
 """Limit that a report states, by the outlet setting of the flow."""
-SHOWN: Final = ("implants", "flow", "change", "quality", "uncertainty")
+SHOWN: Final = ("implants", "together", "flow", "change", "quality", "uncertainty")
 """Metrics of a treatment that have a section of their own."""
 AT_INLETS: Final = "The flow through each inlet is assumed, not measured in the patient."
 """Limit that a report states where the vessel has several inlets."""
@@ -163,6 +164,9 @@ def contents_of(case: "CaseResult", drawing: Drawing | None = None) -> Contents:
         is_repeated = deployment.stent.design.key in told
         implants.append(_implant(title, deployment, measured, (name, key), is_repeated=is_repeated))
         told.add(deployment.stent.design.key)
+    for name, deployed in case.implants.items():
+        if measured := metrics["treatments"][name].get("together"):
+            implants.append(_together(f"{treatment_title(deployed)}, together", measured, name))
     return Contents(
         name=case.name,
         metrics=metrics,
@@ -251,15 +255,31 @@ def _implant(
     wires = f"{len(stent.wire_diameter_um)} wires or struts of {diameters} µm"
     how = "terminated" if deployment.outcome == "terminated" else "stopped at its iteration limit"
     steps = counted(len(deployment.terminated_fraction), "iteration")
+    words = f"The contour {how} after {steps}, in {deployment.seconds:.2f} s."
+    if isinstance(stent.design, Basket):
+        words = f"As many rows of crossings as outside, in {deployment.seconds:.2f} s."
     facts = [(Quantity((f.name,), None).name, f"{f.confidence}: {f.source}") for f in stent.design.facts]
     return {
         "title": title,
-        "words": f"{wires}. The contour {how} after {steps}, in {deployment.seconds:.2f} s.",
+        "words": f"{wires}. {words}",
         "advice": deployment.advice,
         "quantities": flatten({key: value for key, value in measured.items() if key != "bands"}, path),
         "how_sure": how_sure(measured, is_repeated=is_repeated),
         "bands": band_rows(measured),
         "facts": [] if is_repeated else facts,
+    }
+
+
+def _together(title: str, measured: dict[str, Any], name: str) -> dict[str, Any]:
+    """Return title, words and quantities of all implants of a treatment as one, in the form of `_implant`."""
+    return {
+        "title": title,
+        "words": "All devices of this treatment as one.",
+        "advice": "Where they overlap, metal in one place counts once. In the flow, their resistances add.",
+        "quantities": flatten(measured, (name, "together")),
+        "how_sure": "",
+        "bands": [],
+        "facts": [],
     }
 
 

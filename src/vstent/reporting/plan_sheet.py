@@ -7,6 +7,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from vstent.anatomy.landing_zones import ZONE_MM, neck_span_mm
+from vstent.devices.design import Basket
 from vstent.devices.stent import Deployment, Stent
 from vstent.geometry.vessel import Anatomy
 from vstent.plan.criteria import default_criteria
@@ -116,6 +117,17 @@ def _picture(case: Planned, name: str) -> Picture:
 def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the table of device, landing zones and fit, with bands where there are any."""
     stent = deployment.stent
+    if isinstance(stent.design, Basket):
+        keys = {
+            "basket_width_mm": "Width in the sac",
+            "basket_height_mm": "Height in the sac",
+            "protrusion_mm": "Length that stands out into the artery",
+            "neck_uncovered_fraction": "Part of the neck that it leaves open",
+            "neck_metal_coverage_fraction": "Metal coverage over the neck",
+            "apposed_fraction": "Apposed",
+        }
+        cells = [(words, format_value(key, metrics[key])) for key, words in keys.items() if key in metrics]
+        return [("Device and label size, width x height", f"{stent.design.name} {stent.size.label}"), *cells]
     rows = [
         ("Device and label size", f"{stent.design.name} {stent.size.label}"),
         ("Deployed length", f"{stent.deployed_length_mm:.1f} mm {ends(metrics, 'deployed_length_mm')}".rstrip()),
@@ -148,6 +160,8 @@ def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str,
 
 def _size_rows(case: Planned, stent: Stent, metrics: Mapping[str, Any]) -> Sequence[tuple[str, str, str]]:
     """Return the size of a device as it lies and its two best neighboring sizes, with their scores and reasons."""
+    if isinstance(stent.design, Basket):
+        return [("not ranked", "", "Sizes of baskets are not ranked.")]
     measures = {**metrics, **landing_measures(case.anatomy, dict(metrics))}
     own = graded_anew(Candidate(stent.design, stent.size, 0.0, measures, {}, 0.0, False, ""), default_criteria())
     found = [(f"{own.size.label} (this)", own)]

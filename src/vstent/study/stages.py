@@ -17,10 +17,11 @@ from vstent.anatomy.read import read_vessel
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
+from vstent.deployment.coverage import together
 from vstent.deployment.deploy import deploy, propose_landing, propose_size
 from vstent.deployment.measure import measure
 from vstent.devices.catalogue import find_design, find_sizes
-from vstent.devices.design import Size
+from vstent.devices.design import Basket, Size
 from vstent.devices.ranges import how_sure
 from vstent.devices.stent import Deployment, Landing, Stent
 from vstent.devices.treatment import BARE, Implant
@@ -212,7 +213,10 @@ def landing_of(implant: Implant, anatomy: Anatomy, size: Size) -> Landing | None
         return Landing(placing.position_mm, placing.anchor)
     if not placing.shift_mm:
         return None
-    proposed = propose_landing(find_design(implant.device), anatomy, size)
+    design = find_design(implant.device)
+    if isinstance(design, Basket):
+        return Landing(placing.shift_mm, "proximal")
+    proposed = propose_landing(design, anatomy, size)
     return replace(proposed, abscissa_mm=proposed.abscissa_mm + placing.shift_mm)
 
 
@@ -336,6 +340,9 @@ def vary_all(
         if len(deployed) != 1:
             continue
         (deployment,) = deployed.values()
+        if isinstance(deployment.stent.design, Basket):
+            store.progress(stage, 1.0, "left out: baskets are not varied.")
+            continue
         varied = store.find(stage, keys[stage], Uncertainty)
         if varied is None:
 
@@ -364,6 +371,8 @@ def measure_study(
     treatments: dict[str, dict[str, Any]] = {BARE: {}} if fields else {}
     for name, deployed in implants.items():
         treatments[name] = {"implants": {id_: measure(anatomy, one) for id_, one in deployed.items()}}
+        if len(deployed) > 1:
+            treatments[name]["together"] = together(anatomy, [one.stent for one in deployed.values()])
     if fields:
         case = flow_case(anatomy, (), settings.flow)
     for name, field in fields.items():
@@ -380,8 +389,12 @@ def measure_study(
         treatments[name]["quality"] = quality | computation_of(of_flow, field)
     for treatment in settings.treatments:
         for implant in treatment.implants if treatment.name in implants else ():
-            measures = treatments[treatment.name]["implants"][implant.id]
-            measures["bands"] = bands_of(anatomy, implants[treatment.name][implant.id], measures, implant)
+            measures, deployment = (
+                treatments[treatment.name]["implants"][implant.id],
+                implants[treatment.name][implant.id],
+            )
+            if not isinstance(deployment.stent.design, Basket):
+                measures["bands"] = bands_of(anatomy, deployment, measures, implant)
     for name, spread in varied.items():
         treatments[name]["uncertainty"] = spread
     metrics = {"vessel": morphology(anatomy), "treatments": treatments}
