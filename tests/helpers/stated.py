@@ -24,6 +24,7 @@ STATED = {
         "neck.csv",
         Settings(anatomy=AnatomySettings(neck_mm=((1.0, 2.0, 3.0), (4.0, 5.0, 6.0), (7.0, 8.0, 9.0)))),
     ),
+    "no-aneurysm": ("yes", Settings(anatomy=AnatomySettings(without_aneurysm=True))),
     "upstream": ("9", Settings(anatomy=AnatomySettings(upstream_mm=9.0))),
     "downstream": ("8", Settings(anatomy=AnatomySettings(downstream_mm=8.0))),
     "treatment": (

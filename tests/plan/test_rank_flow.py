@@ -114,13 +114,16 @@ def test_a_flow_starts_from_that_of_the_most_similar_coverage(monkeypatch: pytes
     monkeypatch.setattr(rank_flow, "simulate_case", noting)
     monkeypatch.setattr(rank_flow, "indices", lambda *_: dict.fromkeys(rank_flow.REDUCED, 1.0))
     monkeypatch.setattr(rank_flow, "grade", lambda *_: SimpleNamespace(level="good"))
-    flows = rank_flow._Flows(anatomy(), SETTINGS, has_contrast=False, coming=list(covered))
+    kept: list[Any] = []
+    keep = lambda _, field: kept.append(field)  # noqa: E731
+    flows = rank_flow._Flows(anatomy(), SETTINGS, has_contrast=False, coming=list(covered), keep=keep)
     flows.computed(None)
     for fraction in covered:
         flows.computed(replace(one, measures=one.measures | {rank_flow.COVERAGE: fraction}))
     # only 0.32 and 0.30 are similar; the last device misses the neck
     assert begun == [None, None, None, fields[1], None, None]
     assert not flows._done  # no flow is kept from which none starts
+    assert len(kept) == begun.count(None)  # a study would compute these in the same way
 
 
 def test_on_a_gpu_a_flow_is_measured_while_the_next_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:

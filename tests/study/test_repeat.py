@@ -130,7 +130,7 @@ def test_a_record_takes_no_other_settings_nor_its_own_folder(case, capsys):
 ALL = Settings(
     InputSettings("cm", "ras", 2, (0.1, 0.2, 1 / 3), (5, 6, 7), ((0.0, 0.1, 0.2), (1.0, 2.0, 3.0)), 1e-3),
     AnatomySettings(
-        (0.1, 1e-17, -2 / 3), ((1.0, 2.0, 3.0), (4.0, 5.0, 6.0)), (7.0, 8.0, 9.0), ((0.0, 0.0, 1.0),), 9.5, 8.5
+        (0.1, 1e-17, -2 / 3), ((1.0, 2.0, 3.0), (4.0, 5.0, 6.0)), (7.0, 8.0, 9.0), ((0.0, 0.0, 1.0),), 9.5, 8.5, True
     ),
     (
         Treatment(

@@ -154,7 +154,7 @@ class _Flows:
         settings: FlowSettings,
         has_contrast: bool,
         coming: list[float],
-        keep: Callable[[Candidate | None, FlowField], None] | None,
+        keep: Callable[[Candidate | None, FlowField], None] | None = None,
     ) -> None:
         self.anatomy, self.settings, self.has_contrast = anatomy, settings, has_contrast
         self._coming, self._keep = coming, keep

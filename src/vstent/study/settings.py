@@ -90,14 +90,14 @@ class AnatomySettings:
         is_file=True,
         counts=(3, 1000),
     )
-    without_aneurysm: bool = setting(False, "no-aneurysm", "deploy in an artery in which no aneurysm is found", flag)
-    """Whether devices get their proposed places in an artery without an aneurysm too."""
     upstream_mm: float | None = setting(
         None, "upstream", "length of artery kept proximal to the middle of the sac", limits=LENGTH, usual="35"
     )
     downstream_mm: float | None = setting(
         None, "downstream", "length of vessel kept distal to the middle of the sac", limits=LENGTH, usual="25"
     )
+    without_aneurysm: bool = setting(False, "no-aneurysm", "deploy in an artery in which no aneurysm is found", flag)
+    """Whether devices get their proposed places in an artery without an aneurysm too."""
 
 
 @dataclass(frozen=True)
