@@ -43,6 +43,7 @@ STATED = {
     "pulsatile": ("published", Settings(flow=FlowSettings(waveform=OLDER_ADULT_ICA))),
     "steady": ("yes", Settings()),
     "outlets": ("murray", Settings(flow=FlowSettings(outlets="murray"))),
+    "inlet-profile": ("plug", Settings(flow=FlowSettings(profile="plug"))),
     "outlet-shares": ("3, 2, 1", Settings(flow=FlowSettings(shares=(3.0, 2.0, 1.0)))),
     "outlet-exponent": ("2", Settings(flow=FlowSettings(outlet_exponent=2.0))),
     "mean-pressure": ("100", Settings(flow=FlowSettings(mean_pressure_mmHg=100.0))),

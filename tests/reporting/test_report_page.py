@@ -155,7 +155,9 @@ def test_of_a_pulse_it_is_said_which_numbers_are_means(page):
             ("shear-thinning", "cubed"),
         ),
         (
-            FlowSettings(4.0, Blood(thinning=CarreauYasuda()), None, "murray", numerics=Numerics(engine="openfoam")),
+            FlowSettings(
+                4.0, "plug", Blood(thinning=CarreauYasuda()), None, "murray", numerics=Numerics(engine="openfoam")
+            ),
             ("Blood is shear-thinning", "by their diameter cubed", "meshed wires over the neck"),
             ("Newtonian", "pressure at the outlets", "porous screen", "inflow is assumed"),
         ),

@@ -5,12 +5,11 @@ from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vstent.errors import InputError
-from vstent.flow.settings import FlowSettings
+from vstent.flow.settings import FlowSettings, Profile
 from vstent.geometry.vessel import Opening, Vessel, murray_shares
-from vstent.kernels.arrays import Floats
+from vstent.kernels.arrays import Complex, Floats
 from vstent.units import PA_PER_MMHG, counted
 
 MEAN_INLET_SPEED_M_S: Final = 0.27
@@ -21,15 +20,14 @@ ASSUMED: Final = f"assumed: {MEAN_INLET_SPEED_M_S} m/s, the default of VaMPy"
 
 @dataclass(frozen=True)
 class Inflow:
-    """A flow rate in, with the fully developed velocity profile of the opening's section (see `profile`).
-
-    In a pulsatile flow the flow rate follows the waveform.
-    """
+    """A flow rate in, which follows the waveform in a pulsatile flow, with a velocity profile (see `profile`)."""
 
     mean_mL_s: float
     """Mean flow rate in."""
     source: str = ""
     """Where it comes from, for a user; empty: it was given."""
+    profile: Profile = "developed"
+    """Velocity profile."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +76,7 @@ class Resistance:
         """Return R, Pa s/mL; where it is not known, that with which the flow at a mean pressure p is `mean_mL_s`."""
         return self.resistance_Pa_s_mL or (self.pressure_Pa + pressure_Pa) / self.mean_mL_s
 
-    def relative_impedance(self, rate_per_s: Floats) -> NDArray[np.complex128]:
+    def relative_impedance(self, rate_per_s: Floats) -> Complex:
         """Return the complex impedance (n,) at angular frequencies (n,), divided by R."""
         distal = 1 - self.proximal_fraction
         return np.asarray(self.proximal_fraction + distal / (1 + 1j * rate_per_s * distal * self.compliance_time_s))
@@ -99,7 +97,7 @@ def ends_of(vessel: Vessel, settings: FlowSettings) -> tuple[End, ...]:
     if settings.inflow_mL_s is not None:
         inflow_mL_s = settings.inflow_mL_s * murray_shares(inlets)
     source = ASSUMED if settings.inflow_mL_s is None else ""
-    entering = [Inflow(mean_mL_s, source) for mean_mL_s in inflow_mL_s.tolist()]
+    entering = [Inflow(mean_mL_s, source, settings.profile) for mean_mL_s in inflow_mL_s.tolist()]
     if settings.shares is not None and settings.outlets in ("zero_pressure", "murray"):
         raise InputError(
             f"shares of the outlets have no effect with --outlets {settings.outlets}: choose split, resistance or "

@@ -81,8 +81,8 @@ class AbstractEngine(ABC, Generic[State]):
     runs_on_gpu: ClassVar[bool] = False
     """Whether the engine supports the setting ``device_gpu``."""
 
-    has_resistances: ClassVar[bool] = False
-    """Whether the flow out can follow the pressure at the outlets (`vstent.flow.ends.Resistance`)."""
+    has_all_ends: ClassVar[bool] = False
+    """Whether the engine supports resistances at the outlets and velocity profiles that change in a pulse."""
 
     def cost(self, case: FlowCase) -> str:
         """Return a sentence on the expected run time and memory.

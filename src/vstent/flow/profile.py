@@ -1,16 +1,25 @@
-"""Fully developed laminar velocity profile in a section of any shape."""
+"""Laminar velocity profiles in a section of any shape: fully developed, plug and pulsating (Womersley)."""
 
 from typing import Final
 
 import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import spsolve
+from scipy.special import jv
 
 from vstent.kernels import curves
-from vstent.kernels.arrays import Floats
+from vstent.kernels.arrays import Complex, Floats
+from vstent.units import M_PER_MM
 
 POINTS: Final = 64
 """Number of grid points across a section."""
+
+
+def plug_profile(section_mm: Floats, normal: Floats, points_mm: Floats) -> Floats:
+    """Return the axial speed over its mean (n,) of a uniform flow in a flat section (k, 3), at points (n, 3)."""
+    across = _across(normal)
+    depth = _depth((section_mm - section_mm[0]) @ across, (points_mm - section_mm[0]) @ across)
+    return np.where(depth > 0, 1.0, 0.0)
 
 
 def developed_profile(section_mm: Floats, normal: Floats, points_mm: Floats) -> Floats:
@@ -20,9 +29,44 @@ def developed_profile(section_mm: Floats, normal: Floats, points_mm: Floats) -> 
     differences (White 2006, Viscous Fluid Flow, eq. 3-30). The result is interpolated linearly between grid points and
     zero outside.
     """
-    center = section_mm.mean(axis=0)
+    return _developed(section_mm, normal, points_mm)[0]
+
+
+def pulsating_profiles(
+    section_mm: Floats, normal: Floats, points_mm: Floats, rate_per_s: Floats, viscosity_m2_s: float
+) -> Complex:
+    """Return the axial speed over its mean (h, n) of flows that oscillate with frequencies (h,), at points (n, 3).
+
+    In a round section they are exact. Another section is that of the circle of its area at the radius where the
+    developed flow is as far below its maximum; the mean over the section is then 1.
+
+    References
+    ----------
+    Womersley 1955, J. Physiol. 127, 553.
+    """
+    speed, inside = _developed(section_mm, normal, points_mm)
+    around_mm = section_mm - section_mm.mean(axis=0)
+    area_mm2 = abs(float(np.cross(around_mm, np.roll(around_mm, -1, axis=0)).sum(axis=0) @ normal)) / 2
+    radius_m = np.sqrt(area_mm2 / np.pi) * M_PER_MM
+    number = radius_m * np.sqrt(rate_per_s[:, None] / viscosity_m2_s) * 1j**1.5
+
+    def unscaled(of_speed: Floats) -> Complex:
+        outward = np.sqrt(np.clip(1 - of_speed / inside.max(), 0.0, 1.0))
+        return np.asarray(1 - jv(0, number * outward) / jv(0, number))
+
+    return np.asarray(unscaled(speed) / unscaled(inside).mean(axis=1, keepdims=True))
+
+
+def _across(normal: Floats) -> Floats:
+    """Return two axes (3, 2) across a normal."""
     first = curves.any_perpendicular(normal)
-    across = np.stack([first, np.cross(normal, first)], axis=1)
+    return np.stack([first, np.cross(normal, first)], axis=1)
+
+
+def _developed(section_mm: Floats, normal: Floats, points_mm: Floats) -> tuple[Floats, Floats]:
+    """Return the speed over its mean of `developed_profile` at points (n,), and at grid points of the section (m,)."""
+    center = section_mm.mean(axis=0)
+    across = _across(normal)
     polygon = (section_mm - center) @ across
     spacing = float(np.ptp(polygon, axis=0).max()) / POINTS
     low = polygon.min(axis=0) - 2.01 * spacing
@@ -30,9 +74,10 @@ def developed_profile(section_mm: Floats, normal: Floats, points_mm: Floats) -> 
     grid = low + spacing * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
     depth = _depth(polygon, grid)
     speed = _poisson(depth / spacing)
+    inside = speed[depth > 0] / speed[depth > 0].mean()
     speed = _beyond(speed / speed[depth > 0].mean(), depth)
     where = ((points_mm - center) @ across - low) / spacing
-    return np.maximum(ndimage.map_coordinates(speed, where.T, order=1, mode="constant"), 0.0)
+    return np.maximum(ndimage.map_coordinates(speed, where.T, order=1, mode="constant"), 0.0), inside
 
 
 def _depth(polygon: Floats, points: Floats) -> Floats:

@@ -16,6 +16,8 @@ Outlets = Literal["zero_pressure", "murray", "split", "resistance", "windkessel"
 """Condition at the outlets."""
 RESISTING: Final = ("resistance", "windkessel")
 """Conditions with which the flow out follows the pressure."""
+Profile = Literal["developed", "plug", "womersley"]
+"""Velocity profile at the inlets."""
 LATTICE: Final = "lattice_boltzmann"
 """Name of the embedded lattice-Boltzmann engine."""
 OPENFOAM: Final = "openfoam"
@@ -150,6 +152,15 @@ class FlowSettings:
         usual="assumed: 0.27 m/s times their area, as in VaMPy",
     )
     """Mean flow rate through all inlets together; None: 0.27 m/s times the area of each inlet."""
+    profile: Profile = setting(
+        "developed",
+        "inlet-profile",
+        "velocity profile at the inlets: fully developed, plug (uniform), or that of a pulse in a long straight artery "
+        "(womersley)",
+        str,
+        choices=get_args(Profile),
+    )
+    """Velocity profile at every inlet; that of Womersley is the developed one in steady flow."""
     blood: Blood = Blood()
     """The fluid."""
     waveform: Waveform | None = setting(

@@ -178,10 +178,13 @@ def check_engine(flow: FlowSettings | None, *, runs_here: bool = True) -> None:
 
     if flow is not None:
         engine = engine_class(flow.numerics, is_pulsatile=flow.waveform is not None)
-        if flow.outlets in RESISTING and not engine.has_resistances:
+        wanted = [f"--outlets {flow.outlets}"] if flow.outlets in RESISTING else []
+        if flow.profile == "womersley" and flow.waveform is not None:
+            wanted.append(f"--inlet-profile {flow.profile}")
+        if wanted and not engine.has_all_ends:
             raise InputError(
-                f"the engine {flow.numerics.engine} does not support --outlets {flow.outlets}: give fixed shares "
-                f"(--outlets split or murray), or choose the engine {LATTICE}"
+                f"the engine {flow.numerics.engine} does not support {' and '.join(wanted)}: give fixed shares "
+                f"(--outlets split or murray) and a developed or plug profile, or choose the engine {LATTICE}"
             )
         if flow.numerics.engine == OPENFOAM and runs_here:
             program.find()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 from vstent.errors import InputError
 
 if TYPE_CHECKING:
-    from vstent.kernels.arrays import Floats
+    from vstent.kernels.arrays import Complex, Floats
 
 PUBLISHED: Final = "published"
 """Word for the published waveform, in place of the file of a measured one."""
@@ -40,6 +40,14 @@ class Waveform:
 
         angle = 2 * np.pi / self.period_s * np.multiply.outer(time_s, np.arange(1, len(self.cosine) + 1))
         return 1 + np.cos(angle) @ np.array(self.cosine) + np.sin(angle) @ np.array(self.sine)
+
+    @property
+    def harmonics(self) -> "tuple[Floats, Complex]":
+        """Angular frequencies (h,), 1/s, and complex amplitudes (h,) of all harmonics: the sum of Re(A exp(i w t))."""
+        import numpy as np
+
+        rate_per_s = 2 * np.pi / self.period_s * np.arange(1, len(self.cosine) + 1)
+        return np.asarray(rate_per_s, dtype=np.float64), np.array(self.cosine) - 1j * np.array(self.sine)
 
     def curvature_per_s2(self, time_s: "Floats") -> "Floats":
         """Return the second time derivative (t,) of `factor` at times (t,)."""

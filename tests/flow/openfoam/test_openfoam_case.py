@@ -15,7 +15,7 @@ from vstent.anatomy.trace import trace
 from vstent.deployment.deploy import deploy
 from vstent.deployment.struts import struts
 from vstent.devices.catalogue import find_design
-from vstent.errors import FlowError, LandingError
+from vstent.errors import FlowError, InputError, LandingError
 from vstent.flow.case import FlowCase, Target
 from vstent.flow.openfoam.case import foam_case, strut_solids
 from vstent.flow.openfoam.control import fluid
@@ -24,7 +24,8 @@ from vstent.flow.openfoam.dictionary import foam_file
 from vstent.flow.openfoam.patches import named_patches
 from vstent.flow.openfoam.setup import FoamSetup
 from vstent.flow.problem import flow_case, vessel_case
-from vstent.flow.settings import Blood, CarreauYasuda, FlowSettings
+from vstent.flow.settings import Blood, CarreauYasuda, FlowSettings, Numerics
+from vstent.flow.simulation import check_engine
 from vstent.flow.waveform import OLDER_ADULT_ICA
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Vessel
@@ -181,6 +182,34 @@ def test_the_inlet_carries_the_flow_that_was_asked_for() -> None:
     shape = -velocity @ inlet.normal / np.linalg.norm(mean)
     expected = np.maximum(2 * (1 - (radius_m / (RADIUS_MM * 1e-3)) ** 2), 0.0)
     np.testing.assert_allclose(shape, expected, atol=0.05)
+
+
+def with_profile(profile: str, *, is_pulse: bool = False) -> FlowCase:
+    inlet, *outlets = case(is_pulse=is_pulse).ends
+    return replace(case(is_pulse=is_pulse), ends=(replace(inlet, profile=profile), *outlets))
+
+
+def test_a_plug_is_uniform_in_both_dialects() -> None:
+    com, org = (foam_case(with_profile("plug"), replace(SETUP, flavour=flavour)).files for flavour in ("com", "org"))
+    speed = np.linalg.norm(vectors(com["constant/boundaryData/inlet/0/U"]), axis=1)
+    np.testing.assert_allclose(speed[speed > 0], speed[-1])
+    condition = parse(org["0/U"])["boundaryField"]["inlet"]
+    assert condition["type"] == ["flowRateInletVelocity"]
+    assert "profile" not in condition
+
+
+def test_conditions_that_openfoam_lacks_are_refused_before_it_meshes() -> None:
+    assert (
+        foam_case(with_profile("womersley"), SETUP).files == foam_case(case(), SETUP).files
+    )  # the same in steady flow
+    with pytest.raises(InputError, match="cannot have Womersley profiles at its inlets: give"):
+        foam_case(with_profile("womersley", is_pulse=True), SETUP)
+    with pytest.raises(InputError, match="cannot have resistances or Windkessels at its outlets: give"):
+        foam_case(case("windkessel"), SETUP)
+    for settings in (FlowSettings(outlets="resistance"), FlowSettings(profile="womersley", waveform=OLDER_ADULT_ICA)):
+        check_engine(settings)
+        with pytest.raises(InputError, match="the engine openfoam does not support --"):
+            check_engine(replace(settings, numerics=Numerics(engine="openfoam")))
 
 
 @pytest.mark.parametrize("is_pulse", [False, True])

@@ -10,13 +10,13 @@ from typing import assert_never
 import numpy as np
 
 from vstent.flow import sampling
-from vstent.flow.case import PHASES, FlowCase
+from vstent.flow.case import PHASES, FlowCase, Phase
 from vstent.flow.domain import Domain
 from vstent.flow.ends import FlowRate, Inflow, Pressure, Resistance
 from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.scales import Scales
-from vstent.flow.profile import developed_profile
+from vstent.flow.profile import developed_profile, plug_profile, pulsating_profiles
 from vstent.kernels import directions
 from vstent.kernels.arrays import Floats, Ints
 
@@ -26,6 +26,9 @@ SOUND_MEMORY = 0.002
 STILL = 0.05
 """Fraction of the mean inflow below which a cut imposes the velocity profile of the mean flow. The instantaneous
 profile is ill-defined when the flow is that small."""
+
+FINER = 8
+"""Number of moments per phase of a cycle at which a pulsating profile is evaluated; between them it is linear."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,13 +49,37 @@ class Ends:
         usual, shape = self._at(self.close_up, patches, links)
         wanted = usual[:, d3q19.WANTED].copy()
         phases = () if self.close_up is None else self.close_up.outer.phases
-        if not phases:  # the flow through resistances is adjusted at every check of a cycle (see `stepping.follow`)
-            count = PHASES if self.case.resistances and self.case.waveform is not None else 1
-            return usual, wanted, np.zeros((count, len(patches))), np.repeat(shape[None], count, axis=0)
-        moments = [self._at(self._outside.at_phase(phase), patches, links) for phase in phases]
-        factor = self.case.inflow_factor(np.array([phase.time_s for phase in phases]))
-        course = np.stack([rows[:, d3q19.WANTED] for rows, _ in moments]) - factor[:, None] * wanted
-        return usual, wanted, course, np.stack([shape for _, shape in moments])
+        time_s = self._moments_s(phases)
+        course, shapes = np.zeros((len(time_s), len(patches))), np.repeat(shape[None], len(time_s), axis=0)
+        if phases:
+            moments = [self._at(self._outside.at_phase(phase), patches, links) for phase in phases]
+            course += np.stack([rows[:, d3q19.WANTED] for rows, _ in moments])
+            course -= self.case.inflow_factor(time_s)[:, None] * wanted
+            shapes = np.stack([shape for _, shape in moments])
+        first = np.cumsum([0, *map(len, links)])
+        for row, patch in enumerate(patches):
+            if self._is_pulsating(int(patch)):  # the course of the flow rate is in the profile
+                course[:, row], wanted[row] = wanted[row], 0.0
+                shapes[:, first[row] : first[row + 1]] = self._pulsating(int(patch) - 1, links[row], time_s)
+        return usual, wanted, course, shapes
+
+    def _moments_s(self, phases: Sequence[Phase]) -> Floats:
+        """Return the times (m,) in a cycle of the rows of `Links.course`, equally spaced from the first check."""
+        if phases:
+            return np.array([phase.time_s for phase in phases])
+        finer = 0
+        if self.case.waveform is not None:
+            is_pulsating = any(map(self._is_pulsating, range(1, 1 + len(self.case.vessel.inlets))))
+            finer = FINER if is_pulsating else bool(self.case.resistances)
+        if not finer:
+            return np.zeros(1)
+        count = PHASES * finer
+        return np.asarray(self.case.pulse.period_s * (finer + np.arange(count)) / count, dtype=np.float64)
+
+    def _is_pulsating(self, patch: int) -> bool:
+        """Return whether the velocity profile at an end changes its shape over a cycle by Womersley's solution."""
+        end = self.case.ends[patch - 1] if patch <= len(self.case.ends) else None
+        return isinstance(end, Inflow) and end.profile == "womersley" and self.case.waveform is not None
 
     def _at(self, now: CloseUp | None, patches: Ints, links: Sequence[Ints]) -> tuple[Floats, Floats]:
         """Return rows for `d3q19.drive` and profile coefficients (l, 2) of all links at one moment."""
@@ -77,7 +104,7 @@ class Ends:
         shape = np.zeros((len(links), 2))
         match end:
             case Inflow():
-                kind, mean_mL_s, shape = d3q19.INFLOW, end.mean_mL_s, self._developed(k, links, area)
+                kind, mean_mL_s, shape = d3q19.INFLOW, end.mean_mL_s, self._profile(k, links, area, end)
             case FlowRate():
                 kind, mean_mL_s = d3q19.OUTFLOW, end.mean_mL_s
             case Resistance() if k > len(self.case.vessel.inlets):
@@ -103,12 +130,32 @@ class Ends:
         row[d3q19.NORMAL : d3q19.NORMAL + 3] = normal
         return row
 
-    def _developed(self, k: int, links: Ints, area: float) -> Floats:
-        """Return the profile coefficients (l, 2) of the links of inlet `k` for fully developed flow."""
+    def _profile(self, k: int, links: Ints, area: float, end: Inflow) -> Floats:
+        """Return the profile coefficients (l, 2) of the links of inlet `k` for a profile of constant shape."""
         normal = self.case.vessel.openings[k].normal
-        places_mm = np.concatenate([self._along(links, part)[2] for part in (0.0, 0.5, 1.0)])
-        speed = developed_profile(self.domain.sections[k], normal, places_mm)
+        profile = plug_profile if end.profile == "plug" else developed_profile
+        speed = profile(self.domain.sections[k], normal, self._places_mm(links))
         return self._sent(links, normal, area, *(-speed.reshape(3, -1, 1) * normal))
+
+    def _pulsating(self, k: int, links: Ints, time_s: Floats) -> Floats:
+        """Return the profile coefficients (m, l, 2) of the links of inlet `k` at times (m,), relative to mean flow."""
+        case, opening, direction = self.case, self.case.vessel.openings[k], self.domain.link_direction[links]
+        rate_per_s, amplitude = case.pulse.harmonics
+        section = self.domain.sections[k], opening.normal, self._places_mm(links)
+        steady = developed_profile(*section)
+        waves = pulsating_profiles(*section, rate_per_s, case.blood.kinematic_viscosity_m2_s)
+        speed = steady + ((amplitude * np.exp(1j * np.outer(time_s, rate_per_s))) @ waves).real
+        area = opening.area_mm2 / self.domain.cell_size_mm**2
+        rim = _rim(direction, opening.normal, -steady.reshape(3, -1, 1)[1] * opening.normal)
+        result = np.zeros((len(time_s), len(links), 2))
+        for row, (flow, now) in enumerate(zip(area * case.pulse.factor(time_s), speed, strict=True)):
+            inner, at, outer = -now.reshape(3, -1, 1) * opening.normal
+            result[row] = self._sent(links, opening.normal, flow, inner, at, outer, rim)
+        return result
+
+    def _places_mm(self, links: Ints) -> Floats:
+        """Return the near ends, middles and far ends (3 l, 3) of links."""
+        return np.concatenate([self._along(links, part)[2] for part in (0.0, 0.5, 1.0)])
 
     def _entry(self, now: CloseUp, part: int, links: Ints) -> tuple[Floats, Floats]:
         """Return the row and profile coefficients of a cut with inflow.
@@ -167,14 +214,23 @@ class Ends:
         area = float(np.linalg.norm(faces))
         return faces / area, area
 
-    def _sent(self, links: Ints, normal: Floats, area: float, inner: Floats, at: Floats, outer: Floats) -> Floats:
+    def _sent(
+        self,
+        links: Ints,
+        normal: Floats,
+        area: float,
+        inner: Floats,
+        at: Floats,
+        outer: Floats,
+        rim: Floats | None = None,
+    ) -> Floats:
         """Return the source coefficients (l, 2) of an inflow: linear and quadratic in its mean speed.
 
         The velocities (l, 3) are those at the near end, the middle and the far end of every link.
 
         Links at the rim of the opening end at the wall instead of the opening, and their share of the flow would be
-        missing. It is added to the links near the rim. Scaling the whole profile instead would make the velocity on the
-        axis too high, and this error persists for tens of diameters downstream.
+        missing. It is added to the links near the `rim`. Scaling the whole profile instead would make the velocity on
+        the axis too high, and this error persists for tens of diameters downstream.
 
         A velocity profile gains momentum from the relaxation rate of the odd populations, which would push blood
         towards the axis: the inflow sends it back through the links with opposite sign.
@@ -184,7 +240,20 @@ class Ends:
         sent = -6 * weight * (c * at).sum(axis=1)
         of_inner, of_outer = (4.5 * (c * u).sum(axis=1) ** 2 - 1.5 * (u**2).sum(axis=1) for u in (inner, outer))
         pushed = (2 / self.scales.odd_rate - 1) * weight * (of_outer - of_inner)
-        speed = -(at @ normal)
-        rim = np.where(speed > 0, weight * np.maximum(c @ normal, 0.0) * (1 - speed / speed.max()), 0.0)
-        rim /= rim.sum()
+        rim = _rim(direction, normal, at) if rim is None else rim
         return np.stack([sent + (area - sent.sum()) * rim, pushed - pushed.sum() * rim], axis=1)
+
+
+def _rim(direction: Ints, normal: Floats, at: Floats) -> Floats:
+    """Return the share (l,) of every link in what is missing at the rim, from the velocity (l, 3) there.
+
+    A uniform flow is slowest nowhere: all links that bring blood have a share.
+    """
+    c, weight = directions.VELOCITIES[direction], d3q19.WEIGHTS[direction]
+    speed = -(at @ normal)
+    of_link = weight * np.maximum(c @ normal, 0.0)
+    rim = np.where(speed > 0, of_link * (1 - speed / speed.max()), 0.0)
+    if not rim.any():
+        rim = np.where(speed > 0, of_link, 0.0)
+    rim /= rim.sum()
+    return rim

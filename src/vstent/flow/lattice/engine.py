@@ -48,7 +48,7 @@ class AbstractLattice(AbstractEngine[State]):
     refined_by: ClassVar[tuple[str, ...]] = ("cell_size_mm", "lattice_speed")
     closes_up: ClassVar[bool] = True
     runs_on_gpu: ClassVar[bool] = True
-    has_resistances: ClassVar[bool] = True
+    has_all_ends: ClassVar[bool] = True
 
     def cost(self, case: FlowCase) -> str:
         """Return a sentence with grid spacing, memory and run time of a case; refuse it if it cannot run."""

@@ -112,7 +112,7 @@ def build(
 
 def _before_Pa(state: State, start: FlowField | None) -> Floats:
     """Return the pressure (m, k) at the outlets at the checks of a cycle of the flow before, 0 where there is none."""
-    vessel, count = state.case.vessel, len(state.links.course)
+    vessel, count = state.case.vessel, len(state.pace)
     if start is None:
         return np.zeros((count, len(vessel.outlets)))
     if len(start.phases) != count:
@@ -183,7 +183,7 @@ def step(state: State) -> None:
             state.snapshots.append(now)
             state.history.append(np.zeros(0))
             state.since_check = 0
-            if state.has_resistances and len(state.history) % len(state.links.course) == 0:
+            if state.has_resistances and len(state.history) % len(state.pace) == 0:
                 _follow(state)
             _keep_pace(state)
             if state.device is not None:
@@ -204,14 +204,14 @@ def answered_mL_s(state: State, pressure_Pa: Floats) -> Floats:
 
 def at_outlets_Pa(state: State) -> Floats:
     """Return the pressure (m, k) at the outlets at the last check of a steady flow, or at those of the last cycle."""
-    vessel, last = state.case.vessel, list(state.snapshots)[-len(state.links.course) :]
+    vessel, last = state.case.vessel, list(state.snapshots)[-len(state.pace) :]
     sections_Pa = [domains.section_pressure_Pa(vessel, state.domain, one.pressure_Pa.astype(float)) for one in last]
     return np.asarray(np.nan_to_num(sections_Pa)[:, len(vessel.inlets) :], dtype=np.float64)
 
 
 def _cycle_s(state: State) -> Floats:
-    """Return the times (m,) in a cycle of the rows of `Links.course`."""
-    return np.asarray(state.check_s * (1 + np.arange(len(state.links.course))), dtype=np.float64)
+    """Return the times (m,) of the checks in a cycle."""
+    return np.asarray(state.check_s * (1 + np.arange(len(state.pace))), dtype=np.float64)
 
 
 def _follow(state: State) -> None:
@@ -236,7 +236,8 @@ def _asked_mL_s(state: State) -> Floats:
     """Return the flow rates (m, k) that are imposed at the outlets at the checks of a cycle."""
     result = _usual_mL_s(state)
     is_set, outlet, speed_mL_s = of_outlets(state)
-    result[:, outlet] += state.built[0].course[:, is_set] * speed_mL_s
+    course = state.built[0].course
+    result[:, outlet] += course[:: len(course) // len(result), is_set] * speed_mL_s
     return result
 
 
@@ -244,7 +245,11 @@ def _ask(state: State, flow_mL_s: Floats) -> None:
     """Impose flow rates (m, k) at the outlets at the checks of a cycle; the widest takes the rest."""
     links, built = state.links, state.built[0]
     is_set, outlet, speed_mL_s = of_outlets(state)
-    built.course[:, is_set] = (flow_mL_s - _usual_mL_s(state))[:, outlet] / speed_mL_s
+    speed = (flow_mL_s - _usual_mL_s(state))[:, outlet] / speed_mL_s
+    finer = len(built.course) // len(speed)
+    part = (np.arange(len(built.course)) % finer / finer)[:, None]
+    before, after = np.repeat(speed, finer, axis=0), np.repeat(np.roll(speed, -1, axis=0), finer, axis=0)
+    built.course[:, is_set] = before + part * (after - before)
     if links is not built:
         links.course[:] = state.scales.step_s * int(state.pace[0]) / state.check_s * built.course
 
@@ -323,7 +328,8 @@ def imposed(state: State, steps: Floats | Ints) -> tuple[Floats, Floats]:
     links = state.links
     count = len(links.course)
     checks = len(state.history) + steps / state.steps_per_check
-    now, part = np.divmod(checks - 1, 1)  # the first moment is the first check
+    finer = max(1, count // len(state.pace))
+    now, part = np.divmod((checks - 1) * finer, 1)  # the first moment is the first check
     moments = np.column_stack([now % count, (now + 1) % count, part])
     before, after = (links.course[moments[:, k].astype(int)] for k in range(2))
     factor = state.case.inflow_factor(state.check_s * checks)

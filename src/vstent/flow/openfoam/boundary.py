@@ -1,4 +1,4 @@
-"""OpenFOAM boundary conditions: developed profiles at the inlets, zero pressure or a prescribed flow at the outlets."""
+"""OpenFOAM boundary conditions: velocity profiles at the inlets, zero pressure or a prescribed flow at the outlets."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from vstent.flow.case import FlowCase
 from vstent.flow.ends import End, FlowRate, Inflow, Pressure, Resistance
 from vstent.flow.openfoam.dictionary import foam_file, vector
 from vstent.flow.openfoam.setup import FoamSetup
-from vstent.flow.profile import developed_profile
+from vstent.flow.profile import developed_profile, plug_profile
 from vstent.geometry.vessel import Opening
 from vstent.kernels import curves
 from vstent.kernels.arrays import Floats
@@ -26,11 +26,10 @@ ZERO_GRADIENT: Final[dict[str, Any]] = {"type": "zeroGradient"}
 AT_REST: Final[dict[str, Any]] = {"value": "uniform (0 0 0)"}
 """Initial velocity at an opening."""
 
-NO_RESISTANCES: Final = (
-    "an OpenFOAM case cannot have resistances or Windkessels at its outlets: give fixed shares (--outlets split or "
-    "murray)"
+UNSUPPORTED: Final = (
+    "an OpenFOAM case cannot have {}: give fixed shares (--outlets split or murray) and a developed or plug profile"
 )
-"""Message where the outlets of a case have resistances."""
+"""Message on a condition that OpenFOAM's own boundary conditions do not have."""
 
 
 @dataclass(frozen=True)
@@ -69,20 +68,23 @@ def _field(name: str, kind: str, dimensions: str, inside: str, patches: Mapping[
 def _condition(case: FlowCase, setup: FoamSetup, opening: Opening, end: End, section_mm: Floats) -> Condition:
     """Return the condition of one opening, which depends on the type of its end only here."""
     match end:
+        case Inflow() if end.profile == "womersley" and case.waveform is not None:
+            raise InputError(UNSUPPORTED.format("Womersley profiles at its inlets"))
         case Inflow() if setup.dialect.reads_geometry:
-            return _profiled(case, setup, opening, end.mean_mL_s, section_mm)
+            return _profiled(case, setup, opening, end, section_mm)
         case Inflow() | FlowRate():
             flow, files = _over_time(case, setup, "volumetricFlowRate", opening.role, end.mean_mL_s * M3_PER_ML)
             kind: dict[str, Any] = {"type": "flowRateOutletVelocity", **flow}
             if isinstance(end, Inflow):
-                kind = {"type": "flowRateInletVelocity", **flow, "profile": "laminarBL"}
+                shape = {} if end.profile == "plug" else {"profile": "laminarBL"}
+                kind = {"type": "flowRateInletVelocity", **flow, **shape}
             return Condition(kind | AT_REST, ZERO_GRADIENT, files)
         case Pressure():
             free = {"type": "inletOutlet", "inletValue": "uniform (0 0 0)"} | AT_REST
             value = f"uniform {end.pressure_Pa / case.blood.density_kg_m3:.9g}"
             return Condition(free, {"type": "fixedValue", "value": value}, {})
         case Resistance():
-            raise InputError(NO_RESISTANCES)
+            raise InputError(UNSUPPORTED.format("resistances or Windkessels at its outlets"))
         case _:
             assert_never(end)
 
@@ -99,8 +101,8 @@ def _over_time(
     return setup.dialect.cycle(key, patch, table)
 
 
-def _profiled(case: FlowCase, setup: FoamSetup, opening: Opening, flow_mL_s: float, section_mm: Floats) -> Condition:
-    """Return the condition of an inlet with the developed velocity profile of its section.
+def _profiled(case: FlowCase, setup: FoamSetup, opening: Opening, end: Inflow, section_mm: Floats) -> Condition:
+    """Return the condition of an inlet with the velocity profile of its section.
 
     The velocities have the mean of the inlet's mean flow. The mean that OpenFOAM enforces on the patch (`setAverage`)
     follows the values.
@@ -115,9 +117,10 @@ def _profiled(case: FlowCase, setup: FoamSetup, opening: Opening, flow_mL_s: flo
     ticks_mm = np.linspace(-reach_mm, reach_mm, PROFILE_POINTS)
     a, b = (x.ravel() for x in np.meshgrid(ticks_mm, ticks_mm))
     points_mm = center_mm + a[:, None] * first + b[:, None] * second
-    shape = developed_profile(section_mm, inward, points_mm)
+    profile = plug_profile if end.profile == "plug" else developed_profile
+    shape = profile(section_mm, inward, points_mm)
     area_mm2 = abs(float(np.cross(around_mm, np.roll(around_mm, -1, axis=0)).sum(axis=0) @ inward)) / 2
-    mean_m_s = flow_mL_s / area_mm2
+    mean_m_s = end.mean_mL_s / area_mm2
     speed_m_s = shape * mean_m_s / max(float(shape[shape > 0].mean()), 1e-300)
     files = {
         f"boundaryData/{role}/points": _vectors(points_mm * M_PER_MM),
