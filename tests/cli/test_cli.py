@@ -245,7 +245,7 @@ def test_a_number_may_begin_with_a_minus() -> None:
         (["--viscosity", "1e-6"], "Pa s"),
         (["--density", "1.06"], "1.06 g/mL are 1060"),
         (["--flow-rate", "240"], "240 mL/min are 4"),
-        (["--grid-spacing", "200"], "200 mm is out of range: give 0.04 to 1 mm"),
+        (["--grid-spacing", "200"], "200 mm is out of range: give 0.002 to 1 mm"),
     ],
 )
 def test_numbers_in_other_units_are_refused(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -707,7 +707,7 @@ FAULTS: tuple[Fault, ...] = (
         little_memory,
     ),
     Fault(OPTION, "threshold that is no number", run("--threshold", "nan"), INPUT, "'nan' is not a number"),
-    Fault(OPTION, "cells of no size", run("--grid-spacing", "0"), INPUT, "0 mm is out of range: give 0.04 to 1 mm"),
+    Fault(OPTION, "cells of no size", run("--grid-spacing", "0"), INPUT, "0 mm is out of range: give 0.002 to 1 mm"),
     Fault(OPTION, "inflow below zero", run("--flow-rate", "-3"), INPUT, "-3 mL/s is out of range: give above 0"),
     Fault(OPTION, "point of two numbers", run("--at", "1,2"), INPUT, "'1,2' is not 3 numbers"),
     Fault(OPTION, "an inlet given twice", run("--inlet", "0,0,0", "--inlet", "0,1,0"), INPUT, "the same opening"),

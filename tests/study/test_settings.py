@@ -94,7 +94,7 @@ def test_a_field_of_the_page_reaches_its_setting(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "text", "field", "said"),
     [
-        ("grid-spacing", "2", {"flow": {"cell_size_mm": 2.0}}, "2 mm is out of range: give 0.04 to 1 mm"),
+        ("grid-spacing", "2", {"flow": {"cell_size_mm": 2.0}}, "2 mm is out of range: give 0.002 to 1 mm"),
         ("flow-rate", "0", {"flow": {"inflow_mL_s": 0.0}}, "0 mL/s is out of range: give above 0, up to 50 mL/s"),
         ("upstream", "-1", {"upstream_mm": -1.0}, "-1 mm is out of range: give above 0, up to 1000 mm"),
         ("shape", "5,0,5", {"shape": [5, 0, 5]}, "0 is out of range: give 1 to 100000"),
