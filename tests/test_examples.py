@@ -81,7 +81,8 @@ def test_readme_says_the_number_of_a_run(
     measured = measure_study(studied.anatomy, studied.implants, flows, settings, {}, {})["treatments"]
     bare, stented = (measured[name] for name in flows)
     assert {key: one.before for key, one in change.items()}.items() <= bare["flow"].items()
-    assert bare["flow"].keys() - change.keys() == {"unsettled_fraction"}
+    of_outlets = {f"outlet_{k}_{what}" for k in (1, 2) for what in ("share_fraction", "pressure_Pa")}
+    assert bare["flow"].keys() - change.keys() == {"unsettled_fraction", *of_outlets}
     assert {key: one.after for key, one in change.items()}.items() <= stented["flow"].items()
     assert {f"{key}_ratio": one.ratio for key, one in change.items()} == stented["change"]
     assert line == f"neck inflow with Silk / without: {stented['change']['neck_inflow_mL_s_ratio']:.2f}"

@@ -728,9 +728,9 @@ def test_what_cannot_be_chosen_on_the_page_stays_as_the_study_had_it(flown, tmp_
 
 def test_a_setting_that_the_page_does_not_take_is_named(flown, tmp_path):
     folder, told = flown
-    told["settings"]["flow"]["numerics"]["cell_size_mm"] = 0.03
+    told["settings"]["flow"]["numerics"]["cell_size_mm"] = 0.001
     (folder / "run.json").write_text(json.dumps(told))
-    with pytest.raises(ReadError, match=r"grid spacing: 0.03 mm is out of range.*vstent run"):
+    with pytest.raises(ReadError, match=r"grid spacing: 0.001 mm is out of range.*vstent run"):
         Workspace(Cases(tmp_path / "cases")).open(folder)
 
 

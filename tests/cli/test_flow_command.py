@@ -55,6 +55,7 @@ def test_openfoam_gets_the_vessel_after_its_cost_is_told(
         raise FlowError("It is not here")
 
     monkeypatch.setattr(OpenFoam, "init", refused)
+    monkeypatch.setattr("vstent.flow.openfoam.program.find", lambda: None)  # as if it were installed
     write_stl(tmp_path / "tube.stl", phantoms.phantom_surface(phantoms.tube(length_mm=LENGTH_MM, radius_mm=RADIUS_MM)))
     command = ["flow", str(tmp_path / "tube.stl"), "--out", str(tmp_path / "out"), "--engine", "openfoam"]
     assert main([*command, "--units", "mm"]) == 1

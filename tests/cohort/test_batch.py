@@ -280,7 +280,7 @@ def test_the_columns_are_the_options():
 
 @pytest.mark.parametrize("column", STATED)
 def test_a_cell_reaches_its_setting(column, tmp_path, monkeypatch):
-    monkeypatch.setattr("vstent.cohort.cases.check_engine", lambda flow: None)  # there may be no GPU
+    monkeypatch.setattr("vstent.cohort.cases.check_engine", lambda flow, runs_here: None)  # there may be no GPU
     (tmp_path / "neck.csv").write_text(NECK)
     text, expected = STATED[column]
     rows = [{"input": "a.stl", "case": "first", column: text}, {"input": "a.stl", "case": "last"}]

@@ -159,7 +159,7 @@ def test_an_end_lies_where_it_is_landed(method, anchor, row):
 
 @pytest.mark.parametrize("method", ["constant_wire", "zhong2016"])
 def test_a_device_that_leaves_the_artery_is_refused(method):
-    with pytest.raises(LandingError, match=r"it extends \d\.\d mm beyond the proximal end"):
+    with pytest.raises(LandingError, match=r"extends \d\.\d mm beyond the proximal end"):
         deploy(SILK, straight(), size=SIZE, landing=Landing(5.0), method=method)
 
 

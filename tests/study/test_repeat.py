@@ -144,10 +144,16 @@ ALL = Settings(
     ),
     FlowSettings(
         1 / 3,
+        "womersley",
         Blood(1050.0, 0.0035, CarreauYasuda(0.05, 2.0, 1.3, 0.3)),
         OLDER_ADULT_ICA,
-        "murray",
-        Numerics(0.2, True, 20.0, 1e5, 0.02, 9000, 3, 0.03, 0.1, "openfoam", 2, True),
+        "windkessel",
+        (0.5, 1 / 3),
+        2.5,
+        95.0,
+        0.7,
+        0.4,
+        Numerics(0.2, True, True, 20.0, 1e5, 0.02, 9000, 3, 0.03, 0.1, "openfoam", 2, True),
     ),
     Ranges(7, 2, 0.1, 0.2, 0.3, 0.4, 0.5),
 )
