@@ -515,7 +515,9 @@ class Page {
     if (this.isComparing) parts.push(head("Compared"), plainSheet(this.ranking.comparing.sheets(), this.isWhole));
     else if (["device", "deploy"].includes(this.step)) {
       const sheets = this.view.choices.treatments.flatMap(({ name }) => this.measures[name] || []);
-      if (sheets.length) parts.push(head("Deployed"), plainSheet(sheets, this.isWhole));
+      const [alike, others] = [true, false].map((isAlike) => sheets.filter(({ rows }) => (rows[0].key === sheets[0].rows[0].key) === isAlike));
+      if (sheets.length) parts.push(head("Deployed"), plainSheet(alike, this.isWhole));
+      for (const sheet of others.filter(({ rows }) => this.isWhole || rows.some((row) => row.is_first))) parts.push(make("h3", {}, [sheet.title]), plainSheet([sheet], this.isWhole));
     }
     if (this.step === "report") for (const varied of this.sheets?.uncertainty || []) parts.push(...sureSheet(varied));
     if (this.sheets?.anatomy?.length && !(flow && ["flow", "report"].includes(this.step))) parts.push(head("Anatomy"), plainSheet(this.sheets.anatomy, this.isWhole));

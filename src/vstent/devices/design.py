@@ -249,8 +249,8 @@ class Braid:
 class Basket(Braid):
     """A braid that is closed at both ends by a marker, for the inside of a sac; its sizes are widths x heights.
 
-    The free device is a body of revolution with the section |2 r / W|^p + |2 z / H|^p = 1 of a superellipse, for the
-    width W, the height H and the exponent p. The angle of the braid is that at its widest row.
+    The free device is a body of revolution with the section ``|2 r / W|^p + |2 z / H|^p = 1`` of a superellipse, for
+    the width W, the height H and the exponent p. The angle of the braid is that at its widest row.
     """
 
     exponent: float = 2.0
