@@ -169,4 +169,12 @@ class Slurm(AbstractWorkers):
         except ImportError:
             raise InputError(MISSING.format("dask-jobqueue")) from None
         memory, prologue = f"{SPARE * self.memory_MB:.0f}MB", [f"export {name}={value}" for name, value in SAFE.items()]
-        return SLURMCluster(cores=1, processes=1, memory=memory, job_name="vstent", job_script_prologue=prologue)
+        options = {"dashboard_address": ":0"}  # any port: another cluster on this machine may have the usual one
+        return SLURMCluster(
+            cores=1,
+            processes=1,
+            memory=memory,
+            job_name="vstent",
+            job_script_prologue=prologue,
+            scheduler_options=options,
+        )
