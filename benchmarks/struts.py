@@ -1,7 +1,7 @@
 """The screen beside resolved struts, over necks and branches: write `struts.json`, print it as a table.
 
 Usage: python benchmarks/struts.py [--vessel demo|arc] [--cell MM] [--foam-cell MM] [--across CELLS] [-j N]
-                                   [--cases FOLDER] [DEVICE ...]
+                                   [--cases FOLDER] [--walls MM] [DEVICE ...]
 
 The demo's artery, or an arc of one with a sac at its side, cut to 9 mm on either side of the sac, is computed twice
 with every device: by the embedded engine with the device as a screen, and by OpenFOAM with its struts meshed, at least
@@ -10,7 +10,9 @@ part of the device that OpenFOAM meshes (`vstent.deployment.struts.over_restored
 what lies on the artery's wall, is kept besides. The two engines differ in the bare vessel already: what a device
 leaves of each engine's own bare value stands beside. `alignment` is the correlation of the two velocity fields in the
 sac, 1 where they are alike but for their size. A row is kept for every device in every vessel; other rows stay as they
-are. With --cases, OpenFOAM's cases stay in that folder, by vessel and device, and one that is there already resumes.
+are. With --walls, only the embedded engine computes, with the wires as walls of a grid of that spacing, and prints what
+it finds. With --cases, OpenFOAM's cases stay in that folder, by vessel and device, and one that is there already
+resumes.
 """
 
 import argparse
@@ -117,7 +119,13 @@ if __name__ == "__main__":
     parser.add_argument("--across", type=float, default=setup.ACROSS)
     parser.add_argument("-j", dest="processes", type=int, default=1)
     parser.add_argument("--cases", type=Path)
+    parser.add_argument("--walls", type=float)
     given = parser.parse_args()
+    if given.walls:
+        for _, case in cases(given.devices, VESSELS[given.vessel]()).values():
+            if case.solids:
+                computed(case, None, cell_size_mm=given.walls, resolve_wires=True)
+        raise SystemExit
     setup.ACROSS = given.across
     rows = json.loads(TABLE.read_text()) if TABLE.exists() else {}
     foam = {"engine": OPENFOAM, "cell_size_mm": given.foam_cell, "processes": given.processes}
