@@ -45,7 +45,7 @@ class BoxFlow:
     velocity: Floats
     """(i, j, k, 3) velocity, zero inside the wires."""
     drag: Floats
-    """(w, 3) force on every solid, under a body force on the blood alone: its links' share of the whole force.
+    """(w, 3) force on every solid that its links add up to, under a body force on the blood alone.
 
     The links are read after the second step of a pair, when the impulse has faded by 1 to 2 %.
     """
@@ -149,7 +149,7 @@ def flow_through(
         velocity = box.velocity(force)
         mean = velocity.mean(axis=(0, 1))
         if np.abs(mean - before).max() < settled * np.abs(mean).max():
-            return BoxFlow(velocity, box.drag(force), box.is_blood, box.domain.closed_gaps)
+            return BoxFlow(velocity, box.drag(), box.is_blood, box.domain.closed_gaps)
         before = mean
     raise ValueError(f"the flow through the box {shape} has not converged: use a smaller force")
 
@@ -238,12 +238,11 @@ class _Box:
         for q in range(1, 19):
             self._f[q * self._addressing.stride + self._addressing.place] += kick[q]
 
-    def drag(self, force: Floats) -> Floats:
+    def drag(self) -> Floats:
         """Return the force (w, 3) on each solid."""
         address, direction = self._addressing.link_address, self.domain.link_direction
         solids = range(self._solid.max() + 1)
-        read = np.stack([exchanged(self._f, address[own], direction[own]) for own in map(self._solid.__eq__, solids)])
-        return read * (len(self.domain.cells) * (force @ force) / (read.sum(axis=0) @ force))
+        return np.stack([exchanged(self._f, address[own], direction[own]) for own in map(self._solid.__eq__, solids)])
 
     def velocity(self, force: Floats) -> Floats:
         """Return the velocity (i, j, k, 3), with half of the next impulse added."""
