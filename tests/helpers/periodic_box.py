@@ -16,7 +16,7 @@ from vstent.flow.lattice.kernels import d3q19, lanes
 from vstent.flow.lattice.reading import exchanged
 from vstent.flow.lattice.scales import odd_rate
 from vstent.flow.lattice.setup import Addressing, address, wall_weights
-from vstent.geometry.surface import Surface
+from vstent.geometry.surface import Surface, joined
 from vstent.kernels import directions
 from vstent.kernels.arrays import Bools, Floats, Ints
 
@@ -62,16 +62,6 @@ class BoxFlow:
 
 UPWARDS = np.array([0.0, 0.0, 1.0])
 """The third axis of a box."""
-
-
-def joined(solids: Iterable[Surface]) -> Surface:
-    """Return several solids as one surface."""
-    vertices, faces, count = [], [], 0
-    for solid in solids:
-        vertices.append(solid.vertices_mm)
-        faces.append(solid.faces + count)
-        count += len(solid.vertices_mm)
-    return Surface(np.concatenate(vertices), np.concatenate(faces))
 
 
 def swept(axis: Floats, section: Floats, side: Floats = UPWARDS) -> Surface:
@@ -179,7 +169,7 @@ def periodic_domain(shape: tuple[int, int, int], solids: Sequence[Surface]) -> t
     shifts = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3) * shape
     low, high = wires.vertices_mm.min(axis=0), wires.vertices_mm.max(axis=0)
     reaches = ((high + shifts > -3) & (low + shifts < np.array(shape) + 3)).all(axis=1)
-    images = joined(Surface(wires.vertices_mm + shift, wires.faces) for shift in shifts[reaches])
+    images = joined([Surface(wires.vertices_mm + shift, wires.faces) for shift in shifts[reaches]])
     is_blood, closed_gaps = between_wires(np.ones(shape, dtype=bool), images.corners_mm)
     cells = np.argwhere(is_blood).astype(np.int32)
     grid = Cells(cells, np.zeros(3), 1.0)

@@ -11,7 +11,7 @@ from vstent.devices.stent import Stent
 from vstent.flow.ends import End, FlowRate, Inflow, Resistance
 from vstent.flow.settings import Blood, Numerics
 from vstent.flow.waveform import Waveform
-from vstent.geometry.surface import Surface
+from vstent.geometry.surface import Surface, joined
 from vstent.geometry.vessel import Vessel
 from vstent.kernels import voxels
 from vstent.kernels.arrays import Bools, Floats, Ints, freeze, read_only
@@ -94,11 +94,7 @@ class FlowCase:
     def wires(self) -> Surface | None:
         """Closed solids of the implants' wires over necks and ostia, which may overlap; None where there are none."""
         solids = [struts(stent) for stent in self.solids if len(stent.wire_points_mm)]
-        if not solids:
-            return None
-        before = np.cumsum([0, *(len(solid.vertices_mm) for solid in solids)])
-        faces = [solid.faces + first for solid, first in zip(solids, before[:-1], strict=True)]
-        return Surface(np.concatenate([solid.vertices_mm for solid in solids]), np.concatenate(faces))
+        return joined(solids) if solids else None
 
     @property
     def inlets_mL_s(self) -> Floats:

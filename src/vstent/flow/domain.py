@@ -30,7 +30,7 @@ BRANCH_CELLS = 6.0
 """Number of cells across that a branch needs. Tubes at an angle to the grid have 2 to 70 % too much resistance with
 six cells across (Re 10 to 340), 10 to 310 % with four, and 1.4 to 15 times the right one with three."""
 LEAST_ACROSS, ACROSS = 2.0, 4.0
-"""Number of cells that a wire taken as a wall needs across, and that its drag needs for an error below 3 %."""
+"""Number of cells that a wire taken as a wall needs across, and that its drag needs for an error of at most 5 %."""
 WALL = 0
 """Patch number of the wall; opening k has patch number k + 1."""
 BEYOND = -1
@@ -178,12 +178,11 @@ def default_cell_size_mm(case: FlowCase) -> float:
     The cells are counted across the mean diameter 4 V / A of the vessel, or across its inlet where that is narrower,
     because a large sac increases the mean. Wires to be resolved on a grid too coarse for them are refused.
     """
-    numerics = case.numerics
-    volume_mm3 = case.vessel.closed.volume_mm3
-    across_mm = min(mean_diameter_mm(case.vessel), case.vessel.inlet.diameter_mm)
-    by_diameter = across_mm / numerics.cells_per_diameter
-    by_budget = (volume_mm3 / numerics.cell_budget) ** (1 / 3)
-    size_mm = max(by_diameter, by_budget) if numerics.cell_size_mm is None else numerics.cell_size_mm
+    numerics, size_mm = case.numerics, case.numerics.cell_size_mm
+    if size_mm is None:
+        across_mm = min(mean_diameter_mm(case.vessel), case.vessel.inlet.diameter_mm)
+        by_diameter = across_mm / numerics.cells_per_diameter
+        size_mm = max(by_diameter, (case.vessel.closed.volume_mm3 / numerics.cell_budget) ** (1 / 3))
     if numerics.engine == LATTICE and numerics.resolve_wires and case.wires and wires_of(case, size_mm) is None:
         thick_mm = thickness_mm(case.wires)
         raise CoarseGridError(

@@ -1,5 +1,6 @@
 """A triangle mesh in mm, with geometric queries."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -138,3 +139,10 @@ class Surface:
     def first_hits(self, origins_mm: Floats, directions: Floats) -> tuple[Floats, Ints]:
         """Return the distance (n,) in mm along unit rays (n, 3) to the first face, inf without one, and that face."""
         return tree.first_hits(self.tree, origins_mm, directions)
+
+
+def joined(surfaces: Sequence[Surface]) -> Surface:
+    """Return several surfaces as one; they share no vertex."""
+    before = np.cumsum([0, *(len(surface.vertices_mm) for surface in surfaces)])
+    faces = [surface.faces + first for surface, first in zip(surfaces, before[:-1], strict=True)]
+    return Surface(np.concatenate([surface.vertices_mm for surface in surfaces]), np.concatenate(faces))
