@@ -1,9 +1,10 @@
 """The screen beside resolved struts, over necks and branches: write `struts.json`, print it as a table.
 
-Usage: python benchmarks/struts.py [--vessel demo|arc] [--cell MM] [--foam-cell MM] [--across CELLS] [-j N]
+Usage: python benchmarks/struts.py [--vessel demo|arc|tee] [--cell MM] [--foam-cell MM] [--across CELLS] [-j N]
                                    [--cases FOLDER] [--walls MM] [DEVICE ...]
 
-The demo's artery, or an arc of one with a sac at its side, cut to 9 mm on either side of the sac, is computed twice
+The demo's artery, an arc of one with a sac at its side, cut to 9 mm on either side of the sac, or a straight one with a
+small sac, cut to 3 mm, is computed twice
 with every device: by the embedded engine with the device as a screen, and by OpenFOAM with its struts meshed, at least
 so many cells across each, without layers along walls (on wires so fine they do not come to an end). Both have only the
 part of the device that OpenFOAM meshes (`vstent.deployment.struts.over_restored`); what the whole screen does, with
@@ -46,7 +47,6 @@ from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.phantoms import Phantom
 
 TABLE = Path(__file__).with_suffix(".json")
-KEPT_MM = 9.0
 INDICES = ("neck_inflow_mL_s", "mean_sac_velocity_m_s", "mean_sac_wss_Pa")
 
 
@@ -58,17 +58,25 @@ def arc() -> Phantom:
     return phantoms.with_sac(artery, abscissa_mm=middle_mm, width_mm=6.0, neck_mm=4.2, direction=sideways)
 
 
-VESSELS = {"demo": phantoms.demo_phantom, "arc": arc}
+def tee() -> Phantom:
+    """A straight artery 2.6 mm wide with a sac of 2.6 mm on a neck of 2 mm."""
+    artery = phantoms.tube(length_mm=30.0, radius_mm=1.3)
+    sideways = np.array([1.0, 0.0, 0.0])
+    return phantoms.with_sac(artery, abscissa_mm=15.0, width_mm=2.6, neck_mm=2.0, direction=sideways)
 
 
-def cases(names: list[str], phantom: Phantom) -> dict[str, tuple[FlowCase, FlowCase]]:
+VESSELS = {"demo": (phantoms.demo_phantom, 9.0), "arc": (arc, 9.0), "tee": (tee, 3.0)}
+"""Vessels by name, and how much of them is kept on either side of the sac, in mm."""
+
+
+def cases(names: list[str], phantom: Phantom, kept_mm: float) -> dict[str, tuple[FlowCase, FlowCase]]:
     """The bare vessel and every device in it, deployed in the whole one and computed in a short one.
 
     The first case of each has the whole screen, the second only as much as OpenFOAM meshes struts.
     """
     whole = trace(Vessel(phantoms.phantom_surface(phantom, edge_mm=0.2)))
     anatomy = restore(trim(whole))
-    short = trim(whole, upstream_mm=KEPT_MM, downstream_mm=KEPT_MM)
+    short = trim(whole, upstream_mm=kept_mm, downstream_mm=kept_mm)
     inflow_mL_s = flow_case(anatomy, ()).inflow_mL_s
     settings = FlowSettings(inflow_mL_s=inflow_mL_s)
     stents = {name: (vstent.deploy(vstent.find_design(name), anatomy).stent,) for name in names}
@@ -121,8 +129,9 @@ if __name__ == "__main__":
     parser.add_argument("--cases", type=Path)
     parser.add_argument("--walls", type=float)
     given = parser.parse_args()
+    make, kept_mm = VESSELS[given.vessel]
     if given.walls:
-        for _, case in cases(given.devices, VESSELS[given.vessel]()).values():
+        for _, case in cases(given.devices, make(), kept_mm).values():
             if case.solids:
                 computed(case, None, cell_size_mm=given.walls, resolve_wires=True)
         raise SystemExit
@@ -130,7 +139,7 @@ if __name__ == "__main__":
     rows = json.loads(TABLE.read_text()) if TABLE.exists() else {}
     foam = {"engine": OPENFOAM, "cell_size_mm": given.foam_cell, "processes": given.processes}
     bare: tuple[FlowField, dict[str, float]] | None = None
-    for name, (whole_case, case) in cases(given.devices, VESSELS[given.vessel]()).items():
+    for name, (whole_case, case) in cases(given.devices, make(), kept_mm).items():
         # The embedded engine takes its start for the bare flow; OpenFOAM begins from any in this vessel.
         embedded, screened = computed(case, bare[0] if bare else None, cell_size_mm=given.cell)
         folder = None if given.cases is None else given.cases / given.vessel / name

@@ -1,0 +1,130 @@
+"""Resistance of two parallel meshes, and of wires packed like coils, in periodic boxes: write `meshes.json`, print it.
+
+Usage: python benchmarks/meshes.py
+
+Meshes: two families of wires 30 um thick and 0.25 mm apart at 45 degrees to the axis, one mesh `gap_mm` above another
+that is turned by an angle or moved by half a pore. `normal` is the resistance to blood driven straight through, over
+that of one mesh, in creeping flow and at a pore Reynolds number (superficial speed times spacing over viscosity) of 10.
+`along` is the same of blood driven along the meshes in creeping flow, where the resistance is that of a thin sheet that
+lets as much blood pass beside it. Two resistances that add give 2.
+
+Coils: wires of 0.3 mm along the three axes, none of which touch. `permeability_mm2` is that of creeping flow, and
+`c` is its Kozeny constant: K = e^3 / (c S^2) with porosity e and S = 4 (1 - e) / d. Straight capillaries have 2, random
+fibres 6 to 7 (Jackson and James 1986, Can. J. Chem. Eng. 64, 364). `inertia` is the resistance at a pore Reynolds
+number (superficial speed times wire diameter over viscosity) of 10 over that of creeping flow.
+"""
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from vstent.geometry.surface import Surface
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
+from periodic_box import UPWARDS, flow_through, wire
+
+TABLE = Path(__file__).with_suffix(".json")
+WIRE_MM, SPACING_MM = 0.03, 0.25
+CELLS, COIL_CELLS = 3.0, 8.0
+"""Cells across a wire of a mesh, and of a coil."""
+HEIGHT = 72
+"""Height of the boxes of meshes, in cells: nearly three spacings."""
+CREEPING, FAST = 0.1, 10.0
+SETTLED = 2e-4
+SLOW_STEPS, FAST_STEPS = 2.0, 0.65
+"""Relaxation time of the stress in creeping flow and in the other one, in time steps."""
+
+
+def mesh(side: int, height: float, *, is_turned: bool = False, is_moved: bool = False) -> list[Surface]:
+    """Wires of one mesh in a square box, at a height: along both diagonals, or along both sides where it is turned."""
+    if is_turned:
+        count = round(side / (SPACING_MM / WIRE_MM * CELLS))
+        at = side * (np.arange(count) + 0.25) / count
+        over = [wire((0.0, y, height - 0.5 * CELLS), (1, 0, 0), CELLS, 3.0 * side) for y in at]
+        return over + [wire((x, 0.0, height + 0.5 * CELLS), (0, 1, 0), CELLS, 3.0 * side) for x in at]
+    count = round(side / (np.sqrt(2) * SPACING_MM / WIRE_MM * CELLS))
+    at = side * (np.arange(count) + (0.5 if is_moved else 0.0)) / count
+    families = ((1, 1, -0.5 * CELLS), (1, -1, 0.5 * CELLS))
+    return [
+        wire((x, 0.0, height + z), (along, across, 0), CELLS, 5.0 * side) for along, across, z in families for x in at
+    ]
+
+
+def resistance(box: tuple[int, int, int], wires: Sequence[Surface], reynolds: float, size: float) -> float:
+    """Pressure drop over viscosity and speed of blood driven through (lattice units), at about a Reynolds number."""
+    steps = SLOW_STEPS if reynolds == CREEPING else FAST_STEPS
+    viscosity = (steps - 0.5) / 3
+    force = 1e-6
+    for _ in range(1 if reynolds == CREEPING else 2):
+        flow = flow_through(box, wires, force * UPWARDS, settled=SETTLED, relaxation_steps=steps)
+        through = float(flow.superficial_velocity[2])
+        result = force * box[2] / through / viscosity
+        force *= reynolds * viscosity / size / through
+    return result
+
+
+def resistance_along(box: tuple[int, int, int], wires: Sequence[Surface]) -> float:
+    """Drag over viscosity and speed of the thin sheet that lets as much blood pass along it (lattice units)."""
+    force, viscosity = 1e-6, (SLOW_STEPS - 0.5) / 3
+    flow = flow_through(box, wires, force * np.eye(3)[0], settled=SETTLED, relaxation_steps=SLOW_STEPS)
+    beside = force * box[2] ** 2 / (12 * viscosity)
+    return force * box[2] / (float(flow.superficial_velocity[0]) - beside) / viscosity
+
+
+def meshes() -> list[dict[str, object]]:
+    """Rows of the table of two meshes."""
+    rows: list[dict[str, object]] = []
+    spacing = SPACING_MM / WIRE_MM * CELLS
+    for side, second in ((36, "same"), (36, "moved"), (72, "turned by 45 degrees")):
+        box = (side, side, HEIGHT)
+        first = mesh(side, 0.4 * HEIGHT)
+        alone = [resistance(box, first, reynolds, spacing) for reynolds in (CREEPING, FAST)]
+        along = resistance_along(box, first)
+        for gap_mm in (0.0, 0.1):
+            height = 0.4 * HEIGHT + 2 * CELLS + gap_mm / WIRE_MM * CELLS
+            other = mesh(side, height, is_turned=second.startswith("turned"), is_moved=second == "moved")
+            both = [*first, *other]
+            normal = [resistance(box, both, reynolds, spacing) for reynolds in (CREEPING, FAST)]
+            rows.append(
+                {
+                    "second": second,
+                    "gap_mm": gap_mm,
+                    "normal": [round(two / one, 3) for two, one in zip(normal, alone, strict=True)],
+                    "along": round(resistance_along(box, both) / along, 3),
+                }
+            )
+            print(json.dumps(rows[-1]), flush=True)
+    return rows
+
+
+def coils() -> list[dict[str, float]]:
+    """Rows of the table of packed wires."""
+    rows = []
+    for density in (0.15, 0.20, 0.25, 0.30):
+        diameter = COIL_CELLS
+        side = round(diameter * np.sqrt(3 * np.pi / 4 / density))
+        length = 3.0 * side
+        axes = ((0.0, 0.25, 0.25), (0.25, 0.0, 0.75), (0.75, 0.75, 0.0))
+        wires = [wire(side * np.array(at), np.eye(3)[k], diameter, length) for k, at in enumerate(axes)]
+        true = 3 * np.pi / 4 * diameter**2 / side**2
+        creeping = resistance((side, side, side), wires, CREEPING, diameter)
+        fast = resistance((side, side, side), wires, FAST, diameter)
+        permeability = side / creeping * (0.3 / diameter) ** 2
+        specific = 4 * true / 0.3
+        rows.append(
+            {
+                "density": round(float(true), 4),
+                "permeability_mm2": round(float(permeability), 6),
+                "c": round(float((1 - true) ** 3 / (permeability * specific**2)), 3),
+                "inertia": round(fast / creeping, 3),
+            }
+        )
+        print(json.dumps(rows[-1]), flush=True)
+    return rows
+
+
+if __name__ == "__main__":
+    TABLE.write_text(json.dumps({"coils": coils(), "meshes": meshes()}, indent=2) + "\n")
