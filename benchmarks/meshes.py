@@ -30,11 +30,11 @@ TABLE = Path(__file__).with_suffix(".json")
 WIRE_MM, SPACING_MM = 0.03, 0.25
 CELLS, COIL_CELLS = 3.0, 8.0
 """Cells across a wire of a mesh, and of a coil."""
-HEIGHT = 72
-"""Height of the boxes of meshes, in cells: nearly three spacings."""
+HEIGHT = 54
+"""Height of the boxes of meshes, in cells: two spacings."""
 CREEPING, FAST = 0.1, 10.0
 SETTLED = 2e-4
-SLOW_STEPS, FAST_STEPS = 2.0, 0.65
+SLOW_STEPS, FAST_STEPS = 1.0, 0.65
 """Relaxation time of the stress in creeping flow and in the other one, in time steps."""
 
 
@@ -68,8 +68,8 @@ def resistance(box: tuple[int, int, int], wires: Sequence[Surface], reynolds: fl
 
 def resistance_along(box: tuple[int, int, int], wires: Sequence[Surface]) -> float:
     """Drag over viscosity and speed of the thin sheet that lets as much blood pass along it (lattice units)."""
-    force, viscosity = 1e-6, (SLOW_STEPS - 0.5) / 3
-    flow = flow_through(box, wires, force * np.eye(3)[0], settled=SETTLED, relaxation_steps=SLOW_STEPS)
+    force, viscosity = 5e-6, (SLOW_STEPS - 0.5) / 3
+    flow = flow_through(box, wires, force * np.eye(3)[0], settled=5 * SETTLED, relaxation_steps=SLOW_STEPS)
     beside = force * box[2] ** 2 / (12 * viscosity)
     return force * box[2] / (float(flow.superficial_velocity[0]) - beside) / viscosity
 

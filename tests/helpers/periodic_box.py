@@ -45,10 +45,7 @@ class BoxFlow:
     velocity: Floats
     """(i, j, k, 3) velocity, zero inside the wires."""
     drag: Floats
-    """(w, 3) force on every solid that its links add up to, under a body force on the blood alone.
-
-    The links are read after the second step of a pair, when the impulse has faded by 1 to 2 %.
-    """
+    """(w, 3) force on every solid under a body force on the blood alone."""
     is_blood: Bools
     """(i, j, k) whether the cell is blood."""
     closed_gaps: int
@@ -139,7 +136,7 @@ def flow_through(
         velocity = box.velocity(force)
         mean = velocity.mean(axis=(0, 1))
         if np.abs(mean - before).max() < settled * np.abs(mean).max():
-            return BoxFlow(velocity, box.drag(), box.is_blood, box.domain.closed_gaps)
+            return BoxFlow(velocity, box.drag(force), box.is_blood, box.domain.closed_gaps)
         before = mean
     raise ValueError(f"the flow through the box {shape} has not converged: use a smaller force")
 
@@ -228,11 +225,21 @@ class _Box:
         for q in range(1, 19):
             self._f[q * self._addressing.stride + self._addressing.place] += kick[q]
 
-    def drag(self) -> Floats:
-        """Return the force (w, 3) on each solid."""
+    def drag(self, force: Floats) -> Floats:
+        """Return the force (w, 3) on each solid, of which there must be at least one.
+
+        The links are read after the second step of a pair. The first one takes more, because the impulse meets the
+        links at once. Together the solids bear the body force; what the reading lacks of it is shared out as the
+        impulse that meets the links is.
+        """
         address, direction = self._addressing.link_address, self.domain.link_direction
-        solids = range(self._solid.max() + 1)
-        return np.stack([exchanged(self._f, address[own], direction[own]) for own in map(self._solid.__eq__, solids)])
+        way = directions.VELOCITIES[direction]
+        impulse = (d3q19.WEIGHTS[direction] * (way @ force))[:, None] * way
+        solids = [self._solid == solid for solid in range(self._solid.max() + 1)]
+        read = np.stack([exchanged(self._f, address[own], direction[own]) for own in solids])
+        met = np.stack([impulse[own].sum(axis=0) for own in solids])
+        lacking = force * self.is_blood.sum() - read.sum(axis=0)
+        return read + met * (lacking @ force) / (met.sum(axis=0) @ force)
 
     def velocity(self, force: Floats) -> Floats:
         """Return the velocity (i, j, k, 3), with half of the next impulse added."""

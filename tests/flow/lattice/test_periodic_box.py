@@ -88,7 +88,7 @@ def drag_in_channel(diameter: float, degrees: int, reynolds: float, relaxation_s
     return float((flow.drag[0] @ along + pushed) / box[2] / (viscosity * 1.5 * mean))
 
 
-@pytest.mark.parametrize("degrees", [0, 17, pytest.param(45, marks=pytest.mark.validation)])
+@pytest.mark.parametrize("degrees", [17, *(pytest.param(at, marks=pytest.mark.validation) for at in (0, 45))])
 @pytest.mark.parametrize("diameter", [4.0, pytest.param(8.0, marks=pytest.mark.validation)])
 def test_drag_of_a_cylinder_in_a_channel_in_creeping_flow(diameter: float, degrees: int) -> None:
     """Faxen's series as given by Ben Richou, Ambari and Naciri 2004, Chem. Eng. Sci. 59, 3215."""
@@ -96,7 +96,7 @@ def test_drag_of_a_cylinder_in_a_channel_in_creeping_flow(diameter: float, degre
     (first, *logs), powers = FAXEN
     series = first - (1 + sum(a * k ** (2 * n) for n, a in enumerate(logs, 1))) * np.log(k)
     published = 4 * np.pi / (series + sum(b * k ** (2 * n) for n, b in enumerate(powers, 1)))
-    assert drag_in_channel(diameter, degrees, 0.1, 1.0) == pytest.approx(published, rel=0.2 / diameter)
+    assert drag_in_channel(diameter, degrees, 0.1, 0.65) == pytest.approx(published, rel=0.12 / diameter)
 
 
 @pytest.mark.validation
@@ -105,7 +105,7 @@ def test_drag_of_a_cylinder_in_a_channel_in_creeping_flow(diameter: float, degre
 def test_drag_of_a_cylinder_in_a_channel_at_reynolds_20(diameter: float, degrees: int) -> None:
     """Schaefer and Turek 1996, case 2D-1: c_D = 5.5795 at a mean speed U with U d / nu = 20."""
     published = 0.5 * 5.5795 * 20 / 1.5
-    assert drag_in_channel(diameter, degrees, 20.0, 0.56, rounds=3) == pytest.approx(published, rel=0.2 / diameter)
+    assert drag_in_channel(diameter, degrees, 20.0, 0.56, rounds=3) == pytest.approx(published, rel=0.12 / diameter)
 
 
 def test_a_row_of_square_struts_holds_blood_up_as_round_wires_of_their_round_diameter() -> None:
