@@ -6,6 +6,7 @@ import numpy as np
 
 from vstent.anatomy.landing_zones import neck_points_mm, neck_span_mm
 from vstent.anatomy.morphology import Measures
+from vstent.anatomy.restore.paths import on_path
 from vstent.deployment.basket import measure_basket
 from vstent.deployment.coverage import density, quad_areas_mm2
 from vstent.deployment.crowns import free_crowns
@@ -26,7 +27,7 @@ def measure(anatomy: Anatomy, deployment: Deployment) -> Measures:
     Parameters
     ----------
     anatomy : Anatomy
-        The artery.
+        The artery; a device on another path is measured on that.
     deployment : Deployment
         The deployed device.
 
@@ -41,6 +42,7 @@ def measure(anatomy: Anatomy, deployment: Deployment) -> Measures:
     Fractions over the "neck" concern the part of the contour that closes the largest aneurysm. Coverage and pore
     density are measured on the drawn wires. The values of the closed formulas at the same mean diameter are listed too.
     """
+    anatomy = on_path(anatomy, deployment.stent.path)
     stretch = wire_stretches(deployment.stent)
     p95 = float(np.quantile(np.abs(stretch), 0.95))
     stretches = {"mean_wire_stretch_fraction": float(stretch.mean()), "p95_wire_stretch_fraction": p95}

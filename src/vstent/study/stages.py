@@ -14,11 +14,13 @@ import numpy as np
 from vstent.anatomy.morphology import Measures, morphology
 from vstent.anatomy.openings import opening_at
 from vstent.anatomy.read import read_vessel
+from vstent.anatomy.restore.paths import on_path
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
 from vstent.deployment.coverage import together
 from vstent.deployment.deploy import deploy, propose_landing, propose_size
+from vstent.deployment.forks import beyond_mm
 from vstent.deployment.measure import measure
 from vstent.devices.catalogue import find_design, find_sizes
 from vstent.devices.design import Basket, Size
@@ -202,15 +204,18 @@ def deploy_implant(implant: Implant, anatomy: Anatomy, inside: Sequence[Stent] =
     """Deploy an implant in the given or proposed size and place, inside implants that are there in this order."""
     anatomy = on_path(anatomy, implant.placing.path)
     size = size_of(implant, anatomy)
-    landing = landing_of(implant, anatomy, size)
-    return deploy(find_design(implant.device), anatomy, size=size, landing=landing, inside=inside)
+    landing = landing_of(implant, anatomy, size, inside)
+    design, beside = find_design(implant.device), implant.placing.beside
+    return deploy(design, anatomy, size=size, landing=landing, inside=inside, beside=beside)
 
 
-def landing_of(implant: Implant, anatomy: Anatomy, size: Size) -> Landing | None:
+def landing_of(implant: Implant, anatomy: Anatomy, size: Size, inside: Sequence[Stent] = ()) -> Landing | None:
     """Return the given place of an implant on the first path, or the proposed one shifted; None where none is given."""
     placing = implant.placing
     if placing.position_mm is not None:
         return Landing(placing.position_mm, placing.anchor)
+    if placing.at_fork:
+        return Landing(beyond_mm(anatomy.parent, inside), "proximal")
     if not placing.shift_mm:
         return None
     design = find_design(implant.device)
@@ -218,12 +223,6 @@ def landing_of(implant: Implant, anatomy: Anatomy, size: Size) -> Landing | None
         return Landing(placing.shift_mm, "proximal")
     proposed = propose_landing(design, anatomy, size)
     return replace(proposed, abscissa_mm=proposed.abscissa_mm + placing.shift_mm)
-
-
-def on_path(anatomy: Anatomy, name: str) -> Anatomy:
-    """Return the anatomy with a path in the first place, where implants are deployed."""
-    path = anatomy.path(name)
-    return replace(anatomy, paths=(path, *(other for other in anatomy.paths if other is not path)))
 
 
 def size_of(implant: Implant, anatomy: Anatomy) -> Size:
@@ -351,6 +350,7 @@ def vary_all(
 
             with store.stage(stage) as tell:
                 begun = store.unfinished(stage, keys[stage])
+                anatomy = on_path(anatomy, deployment.stent.path)
                 varied = vary(anatomy, deployment, settings.uncertainty, flow=flow, progress=told, checkpoint=begun)
                 tell(f"{len(varied.points)} deployments; {varied.n_failed} of them did not fit.")
             store.save(stage, keys[stage], varied)
@@ -422,7 +422,7 @@ def bands_of(anatomy: Anatomy, deployment: Deployment, measures: Measures, impla
     The band of the proposed size is among them where the implant has no given size.
     """
     is_proposed = implant.diameter_mm is None and implant.length_mm is None
-    found = bands(anatomy, deployment, measures, is_proposed=is_proposed)
+    found = bands(on_path(anatomy, deployment.stent.path), deployment, measures, is_proposed=is_proposed)
     return found.metrics() | {"device": how_sure(deployment.stent.design)}
 
 
