@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from brute import BruteWall, least_gap_mm
 from forks import PHANTOM, arm, fork
+from scipy.spatial import cKDTree
 
 from vstent.anatomy.restore.paths import on_path
 from vstent.deployment.coverage import together
@@ -61,7 +62,12 @@ def test_a_path_into_an_arm_is_that_of_the_phantom(name):
 
 def test_both_arms_of_a_symmetric_fork_have_mirrored_paths():
     one, other = (arm(name).parent.axis for name in ("outlet_1", "outlet_2"))
-    assert np.linalg.norm(other.at(other.nearest_abscissa_mm(one.points_mm * [-1, 1, 1])) - one.points_mm * [-1, 1, 1], axis=1).max() < 0.2
+    assert (
+        np.linalg.norm(
+            other.at(other.nearest_abscissa_mm(one.points_mm * [-1, 1, 1])) - one.points_mm * [-1, 1, 1], axis=1
+        ).max()
+        < 0.2
+    )
 
 
 def test_a_path_from_arm_to_arm_has_both_of_them_and_not_the_trunk():
@@ -96,9 +102,10 @@ def test_all_struts_of_the_second_pass_one_cell_of_the_first(text):
     starts_mm, ends_mm, half_mm = second.pieces_mm
     near = np.linalg.norm(starts_mm - cell.center_mm, axis=1) < 6
     crossing = BruteWall(first.contour).crosses(starts_mm[near], ends_mm[near])
-    at_mm = 0.5 * (starts_mm + ends_mm)[near][crossing]
+    at_mm = 0.5 * (starts_mm + ends_mm)[near][crossing] - cell.center_mm
+    aside_mm = np.linalg.norm(at_mm - np.outer(at_mm @ cell.outward, cell.outward), axis=1)
     assert crossing.sum() >= second.design.n_columns
-    assert np.linalg.norm(at_mm - cell.center_mm, axis=1).max() + half_mm.max() < cell.radius_mm
+    assert aside_mm.max() + half_mm.max() < cell.radius_mm
     # The circle touches a strut of the first stent and holds none.
     a, b, wide_mm = first.pieces_mm
     share = np.clip(np.einsum("ij,ij->i", cell.center_mm - a, b - a) / np.einsum("ij,ij->i", b - a, b - a), 0, 1)
@@ -119,7 +126,7 @@ def test_stents_side_by_side_share_the_trunk_evenly():
         assert (side * x > 0).all()
     assert shares_mm2[0] == pytest.approx(shares_mm2[1], rel=0.03)
     trunk_mm2 = np.pi * 1.75**2
-    assert 0.75 * trunk_mm2 < sum(shares_mm2) < trunk_mm2
+    assert 0.7 * trunk_mm2 < sum(shares_mm2) < trunk_mm2
 
 
 def test_a_stent_that_begins_at_the_fork_touches_no_strut_of_the_first():
@@ -127,7 +134,7 @@ def test_a_stent_that_begins_at_the_fork_touches_no_strut_of_the_first():
     starts_mm, ends_mm, _ = second.pieces_mm
     near = np.linalg.norm(starts_mm - first.nodes_mm.reshape(-1, 3)[:, None], axis=2).min(axis=0) < 2
     assert not BruteWall(first.contour).crosses(starts_mm[near], ends_mm[near]).any()
-    assert 0 < least_gap_mm(first, second) < 1.5
+    assert 0.1 < cKDTree(first.wire_points_mm).query(second.wire_points_mm)[0].min() < 1.5
 
 
 def test_metal_over_a_neck_at_a_fork_is_that_of_both_stents():

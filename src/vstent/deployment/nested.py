@@ -37,7 +37,7 @@ def kept_inside(
         wall_mm, _, face = artery.closest(points_mm)
         inside_mm = wall_mm - stent.design.wall_offset_um * MM_PER_UM * artery.normals[face]
         stent = redrawn(np.where(is_outside[:, None], inside_mm, points_mm).reshape(stent.nodes_mm.shape))
-    for _ in range(ROUNDS if outer else 0):
+    for done in range(ROUNDS if outer else 0):
         inward = stent.nodes_mm.mean(axis=1, keepdims=True) - stent.nodes_mm  # normals turn over where cells crumple
         inward /= curves.lengths(inward)[..., None]
         move_mm = np.zeros(inward.shape[0] * inward.shape[1])
@@ -47,7 +47,8 @@ def kept_inside(
         if not move_mm.any():
             break
         move_mm = maximum_filter(move_mm.reshape(inward.shape[:2]), 3, mode=("nearest", "wrap"))
-        stent = redrawn(stent.nodes_mm + move_mm[..., None] * inward)
+        # Crowns that slide along a strut do not come free by the depth of their overlap alone.
+        stent = redrawn(stent.nodes_mm + (1 + done) * move_mm[..., None] * inward)
     return stent
 
 
