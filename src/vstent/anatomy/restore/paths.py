@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import lru_cache
+from typing import Final
 
 import numpy as np
 
@@ -12,6 +13,10 @@ from vstent.devices.treatment import ARM_TO_ARM
 from vstent.errors import InputError
 from vstent.geometry.vessel import PARENT, Anatomy, Centerline, Path
 from vstent.kernels import curves
+
+ENOUGH_MM: Final = 18.0
+"""Length of artery beside the neck, in mm, up to which these paths are continued: a stent of 14 mm that begins at the
+fork is up to 17 mm long in a narrow arm."""
 
 
 @lru_cache(maxsize=16)
@@ -56,7 +61,7 @@ def _restored(anatomy: Anatomy, name: str) -> Path:
     mouths = [Mouth(sac.neck_mm, (sac.plane or sac.mean_plane).normal) for sac in anatomy.aneurysms]
     landing = close_landing(vessel.lumen, fit_axis(vessel.lumen, line, mouths))
     path = Path(name, landing.axis, landing.section_radius_mm, landing.surface, landing.is_restored.ravel())
-    return continued(replace(anatomy, paths=(path,))).parent
+    return continued(replace(anatomy, paths=(path,)), ENOUGH_MM).parent
 
 
 def _arm_to_arm(first: Centerline, second: Centerline) -> Centerline:
