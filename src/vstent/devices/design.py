@@ -255,6 +255,8 @@ class Basket(Braid):
 
     exponent: float = 2.0
     """Exponent p of the section: 2 of an ellipse, more of a barrel with flat ends."""
+    is_cup: bool = False
+    """Whether the free device is a flat disk of two layers, which opens in the sac as a cup with both of them below."""
     kind: Literal["braid", "basket"] = field(default="basket", init=False)
 
     @property
