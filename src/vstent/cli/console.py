@@ -372,14 +372,17 @@ def device_table(devices: Mapping[str, Design]) -> Table:
     table = Table()
     # A name is typed as it stands: it is never cut, however narrow the terminal.
     table.add_column("name", no_wrap=True, min_width=max(map(len, devices), default=0))
-    for title in ("device", "construction", "sizes (diameter x length, mm)", "numbers cited / derived / estimated"):
+    for title in ("device", "construction", "sizes (diameter x length, mm)", "numbers with a cited source"):
         table.add_column(title, overflow="fold")
     for name, design in devices.items():
-        sure = [sum(fact.confidence == level for fact in design.facts) for level in ("cited", "derived", "estimated")]
+        cited = sum(fact.confidence == "cited" for fact in design.facts)
         diameters = sorted({size.diameter_mm for size in design.sizes})
         lengths = sorted({size.length_mm for size in design.sizes})
-        sizes = f"{diameters[0]:g} to {diameters[-1]:g} x {lengths[0]:g} to {lengths[-1]:g} ({len(design.sizes)} sizes)"
-        table.add_row(name, design.name, design.kind.replace("_", "-"), sizes, " / ".join(map(str, sure)))
+        spans = (
+            " to ".join(dict.fromkeys(f"{mm:g}" for mm in (all_mm[0], all_mm[-1]))) for all_mm in (diameters, lengths)
+        )
+        sizes = f"{' x '.join(spans)} ({len(design.sizes)} sizes)"
+        table.add_row(name, design.name, design.kind.replace("_", "-"), sizes, f"{cited} of {len(design.facts)}")
     return table
 
 

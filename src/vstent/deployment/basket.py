@@ -173,7 +173,7 @@ def _across(axis: Floats, first: Floats) -> Floats:
 def propose_basket(basket: Basket, anatomy: Anatomy) -> Size:
     """Propose a size by the rule in use: one mm wider than the mean of the sac's widths, one lower than its height.
 
-    In a tall sac, width and height are swapped in this rule where that fits: the sac makes the wide and low device tall.
+    In a tall sac, width and height are swapped in this rule where that fits: the sac makes the wide, low device tall.
     A lower one is proposed where it would stand out far into the artery. Of cups, the smallest is proposed that is
     wider than the sac by a factor. A LandingError says that there is no sac, or that its neck is wider than any size.
     """
