@@ -80,7 +80,9 @@ def density(anatomy: Anatomy, stent: Stent) -> Measures:
     pore_mm2, pores_mm, pores = pore_areas_mm2(stent)
     mesh = slice(*stent.mesh_nodes)
     diameter_mm = float(stent.row_diameter_mm[mesh.start : mesh.stop + 1].mean())
+    starts_mm, ends_mm, half_mm = stent.pieces_mm
     found: Measures = {
+        "metal_in_artery_mm2": float(2 * half_mm @ curves.lengths(ends_mm - starts_mm)),
         "metal_coverage_fraction": float(np.average(covered[mesh].ravel(), weights=quad_mm2[mesh].ravel())),
         "metal_coverage_formula_fraction": coverage_fraction(stent.design, stent.size, diameter_mm),
         "pore_density_formula_per_mm2": pore_density_per_mm2(stent.design, stent.size, diameter_mm),

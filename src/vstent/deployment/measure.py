@@ -1,5 +1,6 @@
 """Measure a deployed device: position, apposition, coverage, wire stretch, crumpled cells and covered branches."""
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -149,28 +150,46 @@ def _free_crowns(anatomy: Anatomy, stent: Stent) -> Measures:
 
 
 @lru_cache(maxsize=8)
-def branch_abscissas_mm(anatomy: Anatomy) -> Floats:
-    """Return the arc lengths (b,) on the parent axis, in mm, at which branches leave the parent artery.
+def branches(anatomy: Anatomy) -> tuple[tuple[float, tuple[str, ...]], ...]:
+    """Return the arc lengths on the first path, in mm, at which branches leave it, and the openings they lead to.
 
     Centerlines that leave it at one place, within the radius of the branch, count as one branch.
     """
-    axis, left_mm = anatomy.parent.axis, []
+    axis, left = anatomy.parent.axis, list[tuple[float, tuple[str, ...]]]()
     ostia_mm: list[Floats] = []
-    for line in anatomy.vessel.centerlines:
+    for opening, line in zip(anatomy.vessel.far_ends, anatomy.vessel.centerlines, strict=True):
         foot_mm, distance_mm = curves.project(axis.points_mm, line.points_mm)
         is_away = distance_mm > np.interp(foot_mm, axis.abscissa_mm, anatomy.parent.section_radius_mm)
         is_gone = np.logical_and.accumulate(is_away[::-1])[::-1]
         first = np.argmax(is_gone)
         ostium_mm, radius_mm = line.points_mm[first], line.inscribed_radius_mm[first]
-        if is_gone[-1] and all(np.linalg.norm(ostium_mm - other_mm) > radius_mm for other_mm in ostia_mm):
+        if not is_gone[-1]:
+            continue
+        same = [k for k, other_mm in enumerate(ostia_mm) if np.linalg.norm(ostium_mm - other_mm) <= radius_mm]
+        if same:
+            left[same[0]] = left[same[0]][0], (*left[same[0]][1], opening.role)
+        else:
             ostia_mm.append(ostium_mm)
-            left_mm.append(foot_mm[first])
-    return np.array(left_mm)
+            left.append((float(foot_mm[first]), (opening.role,)))
+    return tuple(left)
+
+
+def jailed_branches(anatomy: Anatomy, stents: Sequence[Stent]) -> tuple[str, ...]:
+    """Return the roles of the openings to which the branches lead that leave between the ends of any of the devices."""
+    jailed = {
+        role
+        for stent in stents
+        if not isinstance(stent.design, Basket)
+        for at_mm, roles in branches(on_path(anatomy, stent.path))
+        if stent.proximal_abscissa_mm <= at_mm <= stent.distal_abscissa_mm
+        for role in roles
+    }
+    return tuple(opening.role for opening in anatomy.vessel.far_ends if opening.role in jailed)
 
 
 def _branches(anatomy: Anatomy, stent: Stent) -> Measures:
     """Return the number of branches between the ends of the device, and each end's distance to the nearest branch."""
-    left_mm = branch_abscissas_mm(anatomy)
+    left_mm = np.array([at_mm for at_mm, _ in branches(anatomy)])
     first_mm, last_mm = stent.proximal_abscissa_mm, stent.distal_abscissa_mm
     found: Measures = {"jailed_branches_count": float(((left_mm >= first_mm) & (left_mm <= last_mm)).sum())}
     if len(left_mm):

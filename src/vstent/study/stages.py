@@ -21,7 +21,7 @@ from vstent.anatomy.trim import trim
 from vstent.deployment.coverage import together
 from vstent.deployment.deploy import deploy, propose_landing, propose_size
 from vstent.deployment.forks import beyond_mm
-from vstent.deployment.measure import measure
+from vstent.deployment.measure import jailed_branches, measure
 from vstent.devices.catalogue import find_design, find_sizes
 from vstent.devices.design import Basket, Size
 from vstent.devices.ranges import how_sure
@@ -42,6 +42,7 @@ from vstent.io.files import is_surface_file
 from vstent.io.images import read_image
 from vstent.kernels.arrays import Floats
 from vstent.plan.bands import bands
+from vstent.plan.treatments import rank_treatments
 from vstent.plan.uncertainty import Uncertainty, vary
 from vstent.study.folder import flow_folder
 from vstent.study.keys import ANATOMY, VESSEL, stage_name
@@ -370,9 +371,7 @@ def measure_study(
     shapes = sac_surfaces(anatomy) if fields else ()
     treatments: dict[str, dict[str, Any]] = {BARE: {}} if fields else {}
     for name, deployed in implants.items():
-        treatments[name] = {"implants": {id_: measure(anatomy, one) for id_, one in deployed.items()}}
-        if len(deployed) > 1:
-            treatments[name]["together"] = together(anatomy, [one.stent for one in deployed.values()])
+        treatments[name] = measure_treatment(anatomy, deployed)
     if fields:
         case = flow_case(anatomy, (), settings.flow)
     for name, field in fields.items():
@@ -398,7 +397,20 @@ def measure_study(
     for name, spread in varied.items():
         treatments[name]["uncertainty"] = spread
     metrics = {"vessel": morphology(anatomy), "treatments": treatments}
+    ranked = rank_treatments(treatments)
+    if len(ranked) > 1:
+        metrics["ranking"] = ranked
     return metrics | ({"failures": dict(failures)} if failures else {})
+
+
+def measure_treatment(anatomy: Anatomy, deployed: Mapping[str, Deployment]) -> dict[str, Any]:
+    """Return the metrics of deployed implants, each and together, and the openings of the branches that they jail."""
+    stents = [one.stent for one in deployed.values()]
+    found: dict[str, Any] = {
+        "implants": {id_: measure(anatomy, one) for id_, one in deployed.items()},
+        "jailed_branches": list(jailed_branches(anatomy, stents)),
+    }
+    return found | ({"together": together(anatomy, stents)} if len(stents) > 1 else {})
 
 
 def neck_notes(metrics: Mapping[str, Any]) -> tuple[str, ...]:
