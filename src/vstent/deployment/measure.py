@@ -157,7 +157,8 @@ def branches(anatomy: Anatomy) -> tuple[tuple[float, tuple[str, ...]], ...]:
     """
     axis, left = anatomy.parent.axis, list[tuple[float, tuple[str, ...]]]()
     ostia_mm: list[Floats] = []
-    for opening, line in zip(anatomy.vessel.far_ends, anatomy.vessel.centerlines, strict=True):
+    names = [opening.role for opening in anatomy.vessel.far_ends]
+    for number, line in enumerate(anatomy.vessel.centerlines):
         foot_mm, distance_mm = curves.project(axis.points_mm, line.points_mm)
         is_away = distance_mm > np.interp(foot_mm, axis.abscissa_mm, anatomy.parent.section_radius_mm)
         is_gone = np.logical_and.accumulate(is_away[::-1])[::-1]
@@ -167,10 +168,10 @@ def branches(anatomy: Anatomy) -> tuple[tuple[float, tuple[str, ...]], ...]:
             continue
         same = [k for k, other_mm in enumerate(ostia_mm) if np.linalg.norm(ostium_mm - other_mm) <= radius_mm]
         if same:
-            left[same[0]] = left[same[0]][0], (*left[same[0]][1], opening.role)
+            left[same[0]] = left[same[0]][0], (*left[same[0]][1], *names[number : number + 1])
         else:
             ostia_mm.append(ostium_mm)
-            left.append((float(foot_mm[first]), (opening.role,)))
+            left.append((float(foot_mm[first]), tuple(names[number : number + 1])))
     return tuple(left)
 
 
