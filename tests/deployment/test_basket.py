@@ -132,6 +132,43 @@ def test_the_proposed_size_is_one_mm_wider_than_the_sac_and_one_lower_and_lower_
     assert deploy(BARREL, sac, size=find_size(BARREL, diameter_mm=8.0, length_mm=5.0)).stent.proximal_abscissa_mm < -0.5
 
 
+def test_in_a_tall_sac_width_and_height_are_swapped_and_the_basket_fills_more_of_it():
+    sac = pot(2.5, 8.0)  # 5 mm wide and 8 mm high
+    swapped = propose_basket(BARREL, sac)
+    assert (swapped.diameter_mm, swapped.length_mm) == (9.0, 4.0)
+    usual = find_size(BARREL, diameter_mm=6.0, length_mm=5.0)  # one up, one down as far as it is made
+    by_rule, by_swap = (measure(sac, deploy(BARREL, sac, size=size)) for size in (usual, swapped))
+    assert by_swap["volume_ratio_fraction"] > 1.2 * by_rule["volume_ratio_fraction"]
+    assert by_swap["apposed_fraction"] > by_rule["apposed_fraction"] > 0.9
+    assert by_swap["protrusion_mm"] < 0.5
+    assert by_swap["neck_uncovered_fraction"] == 0
+
+
+def test_a_cup_lies_below_its_rim_with_both_layers_and_its_wires_keep_their_length():
+    cup = find_design("contour")
+    for sac_mm, label_mm in ((4.0, 11.0), (3.0, 9.0), (6.0, 7.0)):
+        sac = ball(sac_mm, 0.5 * sac_mm)
+        done = deploy(cup, sac, size=find_size(cup, diameter_mm=label_mm))
+        nodes_mm = done.stent.nodes_mm
+        rim = len(nodes_mm) // 2
+        low, high = nodes_mm[:rim], nodes_mm[:rim:-1]
+        apart_mm = np.linalg.norm(high - low, axis=2)
+        assert 0.02 < apart_mm.min() <= apart_mm.max() < 0.1
+        assert (high[1:-3, :, 2] > low[1:-3, :, 2]).all()
+        assert nodes_mm[..., 2].max() == pytest.approx(nodes_mm[rim, :, 2].max(), abs=0.01)
+        assert sac.aneurysms[0].sac.signed_distance(done.stent.wire_points_mm).max() < 0.2
+        found = measure(sac, done)
+        assert found["p95_wire_stretch_fraction"] < 0.05
+        assert found["max_outside_mm"] == 0
+        assert found["neck_uncovered_fraction"] == 0
+        assert found["basket_width_mm"] == pytest.approx(min(2 * sac_mm, label_mm), abs=0.15)
+        assert (found["basket_height_mm"] > 2.5) == (label_mm > 2 * sac_mm)
+
+
+def test_a_cup_is_proposed_a_quarter_wider_than_the_sac():
+    assert [propose_basket(find_design("contour"), ball(r, 0.5 * r)).diameter_mm for r in (2.5, 3.0, 4.0)] == [7, 9, 11]
+
+
 def test_what_makes_no_sense_is_refused_in_a_sentence():
     wide = pot(6.5, 9.0)
     with pytest.raises(LandingError, match=r"neck is up to 13.0 mm wide, and WEB SL 11 mm: the basket would not stay"):

@@ -25,15 +25,15 @@ RELAXING_DIAMETERS: Final = 0.5
 """Length over which the section's difference from a circle decays by a factor e, in diameters."""
 
 
-def continued(anatomy: Anatomy) -> Anatomy:
-    """Continue the parent artery where an end is less than `ENOUGH_MM` from the neck.
+def continued(anatomy: Anatomy, enough_mm: float = ENOUGH_MM) -> Anatomy:
+    """Continue the parent artery where an end is less than `enough_mm` from the neck.
 
     Abscissae then count from the continued proximal end, and the path's `continued_mm` are the lengths added.
     """
     parent = anatomy.parent
     first_mm, last_mm = neck_span_mm(anatomy)
     spare_mm = first_mm, parent.axis.length_mm - last_mm
-    missing_mm = [ENOUGH_MM - spare if spare < ENOUGH_MM else 0.0 for spare in spare_mm]
+    missing_mm = [enough_mm - spare if spare < enough_mm else 0.0 for spare in spare_mm]
     if not any(missing_mm):
         return anatomy
     points_mm = parent.axis.points_mm

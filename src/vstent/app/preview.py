@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from vstent.anatomy.morphology import Measures, morphology
+from vstent.anatomy.restore.paths import on_path
 from vstent.angiography.history import History
 from vstent.angiography.view import angles_of
 from vstent.angiography.working_projection import working_projection
@@ -60,7 +61,7 @@ from vstent.reporting.scene import (
 )
 from vstent.reporting.uncertainty import band_rows, how_sure
 from vstent.study.folder import CACHE
-from vstent.study.stages import ask_for_aneurysm, bands_of, deploy_implant, landing_of, on_path, size_of
+from vstent.study.stages import ask_for_aneurysm, bands_of, deploy_implant, landing_of, size_of
 
 Colour = Literal["wall_gap", "coverage", "diameter"]
 """Quantity that colors the wires."""

@@ -223,6 +223,15 @@ FLOW_COLUMNS: Final = (
 """Columns of a ranking by flow: title, key of the measure and number format."""
 
 
+TREATMENT_COLUMNS: Final = (
+    ("neck inflow", "neck_inflow_change_fraction", "{:+.0%}"),
+    ("sac velocity", "sac_velocity_change_fraction", "{:+.0%}"),
+    ("neck covered", "neck_coverage_fraction", "{:.0%}"),
+    ("metal in artery", "metal_in_artery_mm2", "{:.0f} mm²"),
+)
+"""Columns of a ranking of treatments: title, key of the measure and number format."""
+
+
 def ranking_table(ranking: Ranking, shown: int) -> Table:
     """Return the table of the best candidates of a ranking."""
     measured = {key for candidate in ranking.candidates for key in candidate.measures}
@@ -242,6 +251,23 @@ def ranking_table(ranking: Ranking, shown: int) -> Table:
         "run proposes. In brackets: 95 % band from the ranges of the device's numbers."
     )
     return table
+
+
+def treatments_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Return the table of ranked treatments, with the jailed branches by name and the change of their flow."""
+    table = Table("", "treatment", "score", *(title for title, _, _ in TREATMENT_COLUMNS), "jailed branches")
+    for number, row in enumerate(rows, start=1):
+        cells = ["" if row.get(key) is None else form.format(row[key]) for _, key, form in TREATMENT_COLUMNS]
+        jailed = ", ".join(f"{role} {change:+.0%}" for role, change in row["jailed_branches"].items())
+        score = f"{100 * row['score']:.0f}" if row["is_suitable"] else "out"
+        table.add_row(str(number), row["treatment"], score, *cells, jailed or "none")
+    table.caption = "Scores of 100; with jailed branches: the change of their flow."
+    return table
+
+
+def treatment_reasons(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return one line per treatment with the reasons for its rank."""
+    return "\n".join(f"{n}. {row['treatment']}: {row['reason']}" for n, row in enumerate(rows, start=1))
 
 
 def ranking_reasons(ranking: Ranking, shown: int) -> str:
@@ -372,14 +398,17 @@ def device_table(devices: Mapping[str, Design]) -> Table:
     table = Table()
     # A name is typed as it stands: it is never cut, however narrow the terminal.
     table.add_column("name", no_wrap=True, min_width=max(map(len, devices), default=0))
-    for title in ("device", "construction", "sizes (diameter x length, mm)", "numbers cited / derived / estimated"):
+    for title in ("device", "construction", "sizes (diameter x length, mm)", "numbers with a cited source"):
         table.add_column(title, overflow="fold")
     for name, design in devices.items():
-        sure = [sum(fact.confidence == level for fact in design.facts) for level in ("cited", "derived", "estimated")]
+        cited = sum(fact.confidence == "cited" for fact in design.facts)
         diameters = sorted({size.diameter_mm for size in design.sizes})
         lengths = sorted({size.length_mm for size in design.sizes})
-        sizes = f"{diameters[0]:g} to {diameters[-1]:g} x {lengths[0]:g} to {lengths[-1]:g} ({len(design.sizes)} sizes)"
-        table.add_row(name, design.name, design.kind.replace("_", "-"), sizes, " / ".join(map(str, sure)))
+        spans = (
+            " to ".join(dict.fromkeys(f"{mm:g}" for mm in (all_mm[0], all_mm[-1]))) for all_mm in (diameters, lengths)
+        )
+        sizes = f"{' x '.join(spans)} ({len(design.sizes)} sizes)"
+        table.add_row(name, design.name, design.kind.replace("_", "-"), sizes, f"{cited} of {len(design.facts)}")
     return table
 
 

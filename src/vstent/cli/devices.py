@@ -2,13 +2,22 @@
 
 import argparse
 from pathlib import Path
+from typing import Final
 
 from vstent.cli import options
+
+USES: Final = {
+    "flow diverter": "Flow diverters",
+    "stent for coils": "Stents for coils",
+    "basket": "Baskets for the sac; sizes are width x height",
+}
+"""Title of every use of devices."""
 
 
 def add(commands: options.Commands) -> None:
     """Add the command and its subcommand ``add``."""
     parser = options.add_command(commands, "devices", "List the devices of the catalogue, or add your own.", "devices")
+    parser.add_argument("--find", metavar="TEXT", default="", help="list only devices with this in name, maker or use")
     parser.set_defaults(command=_devices)
     commands_of_devices = parser.add_subparsers(metavar="COMMAND")
     text = "Add devices of your own to the catalogue."
@@ -35,14 +44,24 @@ def add(commands: options.Commands) -> None:
 
 
 def _devices(arguments: argparse.Namespace) -> int:
-    """Print the catalogue; return the exit code."""
+    """Print the catalogue by use, or the devices that match; return the exit code."""
     from vstent.cli.console import Console, device_table
     from vstent.devices.catalogue import baskets, catalogue
+    from vstent.errors import DeviceError
 
-    console = Console()
-    console.print(device_table(catalogue()))
-    console.print("Baskets for the sac; sizes are width x height:")
-    console.print(device_table(baskets()))
+    console, wanted, is_found = Console(), arguments.find.casefold(), False
+    for use, title in USES.items():
+        some = {
+            key: design
+            for key, design in (catalogue() | baskets()).items()
+            if design.use == use and wanted in f"{key} {design.name} {design.maker} {use}".casefold()
+        }
+        if some:
+            console.print(f"{title}:")
+            console.print(device_table(some))
+            is_found = True
+    if not is_found:
+        raise DeviceError(f"No device has {arguments.find!r} in its name, maker or use. Leave out --find to list all.")
     return 0
 
 

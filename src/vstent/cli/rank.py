@@ -1,4 +1,4 @@
-"""`vstent rank`: deploy every size of the chosen devices and rank them."""
+"""`vstent rank`: deploy every size of the chosen devices and rank them, or rank whole treatments by their flows."""
 
 import argparse
 from pathlib import Path
@@ -13,10 +13,10 @@ SHOWN: Final = 15
 
 def add(commands: options.Commands) -> None:
     """Add the command."""
-    text = "Deploy every size of the chosen devices, measure them and rank them."
+    text = "Deploy every size of the chosen devices and rank them; or rank whole treatments by their flows."
     parser = options.add_command(commands, "rank", text, "rank artery.stl --device silk --device pipeline --out case")
     options.add_case(parser)
-    of_treatments = ("treatment", "diameter", "length", "center")
+    of_treatments = ("diameter", "length", "center")
     options.add_settings(parser, *options.VESSEL, "treatments", "flow", without=("no-flow", *of_treatments))
     ranking = parser.add_argument_group("ranking")
     ranking.add_argument("--criteria", type=Path, metavar="TOML", help="ranking criteria (default: vstent's own)")
@@ -32,6 +32,39 @@ def add(commands: options.Commands) -> None:
 
 def _rank(arguments: argparse.Namespace) -> int:
     """Run the command; return the exit code. An interrupted ranking with flows resumes."""
+    return _rank_treatments(arguments) if arguments.treatment else _rank_sizes(arguments)
+
+
+def _rank_treatments(arguments: argparse.Namespace) -> int:
+    """Compute the flows of treatments, and rank these; return the exit code: 1 where one failed."""
+    from vstent.cli.console import Console, treatment_reasons, treatments_table
+    from vstent.errors import InputError
+    from vstent.io.writers import write_json
+    from vstent.study.pipeline import run
+
+    of_sizes = arguments.criteria or arguments.flow_count or arguments.retention or arguments.shift != (0.0,)
+    if of_sizes or arguments.scheduler or arguments.slurm:
+        raise InputError("With --treatment, whole treatments are ranked by their flows: give only settings of those.")
+    console, out = Console(), arguments.out
+    with console.live():
+        case = run(
+            arguments.input, out, options.given_settings(arguments), console.progress, replaces=arguments.replace
+        )
+    ranked = case.metrics.get("ranking", [])
+    if ranked:
+        write_json(out / "treatments.json", ranked)
+        console.print(treatments_table(ranked))
+        console.print(treatment_reasons(ranked))
+        console.print(f"All in {out / 'treatments.json'} and metrics.json. Research use only.")
+    for name, sentence in case.failures.items():
+        console.say(f"vstent: {name}: {sentence}")
+    if not ranked:
+        console.say("vstent: there is nothing to rank: give at least two treatments whose flows can be computed.")
+    return 1 if case.failures or not ranked else 0
+
+
+def _rank_sizes(arguments: argparse.Namespace) -> int:
+    """Rank sizes of devices; return the exit code."""
     from vstent.cli.console import Console, ranking_reasons, ranking_table
     from vstent.devices.catalogue import find_design
     from vstent.errors import InputError

@@ -49,7 +49,14 @@ def study(
     The arguments state the case folder, and whether results are replaced and the report is printed.
     """
     from vstent.angiography.filming import FilmSettings
-    from vstent.cli.console import angiogram_table, comparison_table, device_sentences, uncertainty_table
+    from vstent.cli.console import (
+        angiogram_table,
+        comparison_table,
+        device_sentences,
+        treatment_reasons,
+        treatments_table,
+        uncertainty_table,
+    )
     from vstent.reporting.drawing import Drawing
     from vstent.reporting.film_case import film_case
     from vstent.reporting.write import write_report
@@ -73,6 +80,9 @@ def study(
         write_report(case, out, is_printed=arguments.pdf, drawing=drawing)
         console.progress(Progress("report", 1.0, str(out / "report.html")))
     console.print(comparison_table(case.metrics))
+    if ranked := case.metrics.get("ranking"):
+        console.print(treatments_table(ranked))
+        console.print(treatment_reasons(ranked))
     for sentence in device_sentences(case.metrics):
         console.print(sentence)
     if settings.uncertainty is not None:

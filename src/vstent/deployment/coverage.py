@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from vstent.anatomy.morphology import Measures
+from vstent.anatomy.restore.paths import on_path
 from vstent.deployment.crowns import free_crowns
 from vstent.devices.formulas import coverage_fraction, grid, mesh_rows, pore_density_per_mm2
 from vstent.devices.stent import Stent
@@ -17,6 +18,8 @@ from vstent.kernels.arrays import Bools, Floats, Ints
 
 NECK_TOLERANCE_MM: Final = 0.02
 """Largest distance between the neck and the landing surface, in mm, since the two have different triangles."""
+ON_PATH_MM: Final = 0.5
+"""Distance from the landing surface, in mm, within which wires of a device on another path lie on this one too."""
 SAMPLES_PER_QUAD: Final = 8
 """Number of points per direction at which coverage is sampled in every quad of the contour."""
 
@@ -77,7 +80,9 @@ def density(anatomy: Anatomy, stent: Stent) -> Measures:
     pore_mm2, pores_mm, pores = pore_areas_mm2(stent)
     mesh = slice(*stent.mesh_nodes)
     diameter_mm = float(stent.row_diameter_mm[mesh.start : mesh.stop + 1].mean())
+    starts_mm, ends_mm, half_mm = stent.pieces_mm
     found: Measures = {
+        "metal_in_artery_mm2": float(2 * half_mm @ curves.lengths(ends_mm - starts_mm)),
         "metal_coverage_fraction": float(np.average(covered[mesh].ravel(), weights=quad_mm2[mesh].ravel())),
         "metal_coverage_formula_fraction": coverage_fraction(stent.design, stent.size, diameter_mm),
         "pore_density_formula_per_mm2": pore_density_per_mm2(stent.design, stent.size, diameter_mm),
@@ -95,31 +100,44 @@ def density(anatomy: Anatomy, stent: Stent) -> Measures:
 
 
 def together(anatomy: Anatomy, stents: Sequence[Stent]) -> Measures:
-    """Measure several devices of one treatment as a whole, on the parent artery.
+    """Measure several devices of one treatment as a whole.
 
-    Metal over the neck is what is under a wire of any of them, as a fraction of the whole neck.
+    Metal over the neck is what is under a wire of any of them, as a fraction of the whole neck. Devices on several
+    paths have no common length, and the neck is that on each of these paths.
     """
-    from vstent.kernels.coverage import covered_fractions  # compiles on first use
+    found: Measures = {} if len({stent.path for stent in stents}) > 1 else _lengths_together(stents)
+    covered_mm2 = neck_mm2 = 0.0
+    for name in dict.fromkeys(stent.path for stent in stents) if anatomy.aneurysms else ():
+        covered, areas_mm2 = _neck_under_wires(on_path(anatomy, name), stents)
+        covered_mm2, neck_mm2 = covered_mm2 + float(covered @ areas_mm2), neck_mm2 + float(areas_mm2.sum())
+    return found | ({"neck_union_coverage_fraction": covered_mm2 / neck_mm2} if neck_mm2 else {})
 
+
+def _lengths_together(stents: Sequence[Stent]) -> Measures:
+    """Return the length with any device, and that with more than one."""
     meshes_mm = sorted(stent.mesh_abscissa_mm for stent in stents)
     edges_mm = np.unique(meshes_mm)
     middles_mm, lengths_mm = 0.5 * (edges_mm[1:] + edges_mm[:-1]), np.diff(edges_mm)
     layers = sum((middles_mm > first_mm) & (middles_mm < last_mm) for first_mm, last_mm in meshes_mm)
-    found: Measures = {
+    return {
         "covered_length_mm": float(lengths_mm[layers > 0].sum()),
         "overlap_length_mm": float(lengths_mm[layers > 1].sum()),
     }
-    if anatomy.aneurysms:
-        nodes_mm = anatomy.parent.landing_surface.vertices_mm.reshape(len(anatomy.parent.axis.points_mm), -1, 3)
-        starts_mm, ends_mm, half_mm = (
-            np.concatenate(part) for part in zip(*(s.pieces_mm for s in stents), strict=True)
-        )
-        covered = covered_fractions(nodes_mm, starts_mm, ends_mm, half_mm, SAMPLES_PER_QUAD)
-        areas_mm2 = anatomy.parent.landing_surface.areas_mm2.reshape(2, *covered.shape).sum(axis=0)
-        on_neck = is_over_neck(anatomy, quad_middles_mm(nodes_mm).reshape(-1, 3)).reshape(covered.shape)
-        if on_neck.any():
-            found["neck_union_coverage_fraction"] = float(np.average(covered[on_neck], weights=areas_mm2[on_neck]))
-    return found
+
+
+def _neck_under_wires(anatomy: Anatomy, stents: Sequence[Stent]) -> tuple[Floats, Floats]:
+    """Return covered fraction (n,) and area (n,), in mm2, of the quads of the first path that close the neck."""
+    from vstent.kernels.coverage import covered_fractions  # compiles on first use
+
+    path = anatomy.parent
+    nodes_mm = path.landing_surface.vertices_mm.reshape(len(path.axis.points_mm), -1, 3)
+    starts_mm, ends_mm, half_mm = (np.concatenate(part) for part in zip(*(s.pieces_mm for s in stents), strict=True))
+    is_here = np.repeat([stent.path == path.name for stent in stents], [len(s.piece_starts) for s in stents])
+    is_here[~is_here] = path.landing_surface.closest(starts_mm[~is_here])[1] < ON_PATH_MM
+    covered = covered_fractions(nodes_mm, starts_mm[is_here], ends_mm[is_here], half_mm[is_here], SAMPLES_PER_QUAD)
+    areas_mm2 = path.landing_surface.areas_mm2.reshape(2, *covered.shape).sum(axis=0)
+    on_neck = is_over_neck(anatomy, quad_middles_mm(nodes_mm).reshape(-1, 3)).reshape(covered.shape)
+    return covered[on_neck], areas_mm2[on_neck]
 
 
 @lru_cache(maxsize=8)

@@ -29,6 +29,9 @@ wide, turns of 90 and 180 degrees).
 """
 BENT: Final = 0.1
 """Product of curvature and diameter above which an artery has an inner and an outer side, without unit."""
+OFF_AXIS: Final = 0.25
+"""Distance of the middle of a row from the axis, in row diameters, from which cells are seen from that middle: the rows
+of a stent that shares an artery with another one do not surround the axis."""
 BESIDE: Final = 0.5
 """Largest cosine of the angle between a cell and the plane of the bend at which it is on neither side of the bend."""
 
@@ -67,7 +70,9 @@ def cells(stent: Stent, axis: Centerline) -> Cells:
     middle_mm = 0.25 * (low_mm + high_mm + 0.5 * (left_mm + right_mm + left_above_mm + right_above_mm))
     abscissa_mm, across = axis.nearest_abscissa_mm(middle_mm), planes(axis)
     normal = across.at(abscissa_mm)[1][:, 0]
-    outward = middle_mm - axis.at(abscissa_mm)
+    off_mm = stent.nodes_mm.mean(axis=1)[:: shape.row_split][row] - axis.at(abscissa_mm)
+    is_off = curves.lengths(off_mm) > OFF_AXIS * stent.row_diameter_mm[:: shape.row_split][row]
+    outward = middle_mm - axis.at(abscissa_mm) - is_off[:, None] * off_mm
     outward = outward - np.einsum("kj,kj->k", outward, normal)[:, None] * normal
     outward = outward / curves.lengths(outward)[:, None]
     turning = np.gradient(across.frames[:, 0], across.abscissa_mm, axis=0)

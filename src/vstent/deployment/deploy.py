@@ -6,13 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from vstent.deployment import sizing, wires
+from vstent.deployment import forks, sizing, wires
 from vstent.deployment.advice import advise
 from vstent.deployment.basket import deploy_basket
 from vstent.deployment.braid import ConstantWire
 from vstent.deployment.method import AbstractMethod, Course, Placement, Progress, Zhong2016, laid_inside, run
 from vstent.deployment.nested import kept_inside
-from vstent.deployment.wall import landing_wall
 from vstent.devices.catalogue import find_design
 from vstent.devices.design import Basket, Design, Size
 from vstent.devices.formulas import compacted
@@ -30,7 +29,7 @@ propose_landing = sizing.propose_landing
 propose_size = sizing.propose_size
 
 
-def deploy(
+def deploy(  # noqa: PLR0913 one keyword for each thing that can be chosen
     design: Design | str,
     anatomy: Anatomy,
     *,
@@ -39,9 +38,10 @@ def deploy(
     method: AbstractMethod | str = "constant_wire",
     compaction_fraction: float = 0.0,
     inside: Sequence[Stent] = (),
+    beside: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Deployment:
-    """Deploy a device in the parent artery, or a basket in the largest sac.
+    """Deploy a device on the first path of an artery, the parent artery, or a basket in the largest sac.
 
     Parameters
     ----------
@@ -60,7 +60,10 @@ def deploy(
     compaction_fraction : float, optional
         Fraction by which pushing shortens a braid relative to its natural length; negative when pulled.
     inside : sequence of Stent, optional
-        Devices that are already in the artery. Where they overlap, this device opens inside them (telescoping).
+        Devices that are already in the artery. Where they overlap, this device opens inside them (telescoping), and it
+        passes through a cell of those that lie on another path (a Y at a fork).
+    beside : sequence of str, optional
+        Names of the paths of devices side by side with this one; each gets its share of the artery (kissing).
     progress : callable, optional
         Called after every iteration with its number and the fraction of nodes terminated.
 
@@ -96,25 +99,30 @@ def deploy(
     dd_mm = design.wall_offset_um * MM_PER_UM
     chosen = replace(method, contour=replace(method.contour, dd_mm=dd_mm))
     size = compacted(design, size or propose_size(design, anatomy), compaction_fraction)
-    wall, is_patient = landing_wall(anatomy, inside)
+    start_mm = landing.abscissa_mm if landing and landing.anchor == "proximal" else -np.inf
+    along = forks.way(anatomy, inside, beside, start_mm)
+    wall = along.wall
 
     def opened_at(there: Landing) -> Course:
-        return run(chosen, Placement(design, size, there, anatomy, wall), progress)
+        there = replace(there, abscissa_mm=along.from_plain_mm(there.abscissa_mm))
+        return run(chosen, Placement(design, size, there, along.anatomy, wall), progress)
 
     course = laid_inside(opened_at, propose_landing(design, anatomy, size)) if landing is None else opened_at(landing)
     nodes_mm, crowns = course.opened.contour.nodes_mm, course.opened.crowns
+    rows_mm = along.to_plain_mm(course.opened.abscissa_mm)
 
     def drawn(nodes_mm: Floats) -> Stent:
         found = wires.draw(design, size, nodes_mm, wall, crowns)
-        return Stent(design, size, nodes_mm, course.opened.abscissa_mm, *found, crowns.shift_mm)
+        return Stent(design, size, nodes_mm, rows_mm, *found, crowns.shift_mm, anatomy.parent.name)
 
-    stent = kept_inside(drawn(nodes_mm), drawn, inside, anatomy.parent.landing_surface)
+    nested = course.opened.abscissa_mm < along.nested_to_mm
+    stent = kept_inside(drawn(nodes_mm), drawn, inside, anatomy.parent.landing_surface, nested)
     contact = wall.contact(stent.nodes_mm.reshape(-1, 3))
     gap_mm = np.maximum(contact.distance_mm - dd_mm, 0.0).reshape(nodes_mm.shape[:2])
     return Deployment(
         stent=stent,
         outcome=course.outcome,
-        advice=advise(anatomy, stent, course, gap_mm, is_patient[contact.face].reshape(gap_mm.shape)),
+        advice=advise(anatomy, stent, course, gap_mm, along.is_patient[contact.face].reshape(gap_mm.shape)),
         terminated_fraction=np.array(course.terminated_fraction),
         seconds=time.perf_counter() - began,
         wall_gap_mm=gap_mm,

@@ -1,11 +1,13 @@
 """Measure a deployed device: position, apposition, coverage, wire stretch, crumpled cells and covered branches."""
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
 
 from vstent.anatomy.landing_zones import neck_points_mm, neck_span_mm
 from vstent.anatomy.morphology import Measures
+from vstent.anatomy.restore.paths import on_path
 from vstent.deployment.basket import measure_basket
 from vstent.deployment.coverage import density, quad_areas_mm2
 from vstent.deployment.crowns import free_crowns
@@ -26,7 +28,7 @@ def measure(anatomy: Anatomy, deployment: Deployment) -> Measures:
     Parameters
     ----------
     anatomy : Anatomy
-        The artery.
+        The artery; a device on another path is measured on that.
     deployment : Deployment
         The deployed device.
 
@@ -41,6 +43,7 @@ def measure(anatomy: Anatomy, deployment: Deployment) -> Measures:
     Fractions over the "neck" concern the part of the contour that closes the largest aneurysm. Coverage and pore
     density are measured on the drawn wires. The values of the closed formulas at the same mean diameter are listed too.
     """
+    anatomy = on_path(anatomy, deployment.stent.path)
     stretch = wire_stretches(deployment.stent)
     p95 = float(np.quantile(np.abs(stretch), 0.95))
     stretches = {"mean_wire_stretch_fraction": float(stretch.mean()), "p95_wire_stretch_fraction": p95}
@@ -147,28 +150,47 @@ def _free_crowns(anatomy: Anatomy, stent: Stent) -> Measures:
 
 
 @lru_cache(maxsize=8)
-def branch_abscissas_mm(anatomy: Anatomy) -> Floats:
-    """Return the arc lengths (b,) on the parent axis, in mm, at which branches leave the parent artery.
+def branches(anatomy: Anatomy) -> tuple[tuple[float, tuple[str, ...]], ...]:
+    """Return the arc lengths on the first path, in mm, at which branches leave it, and the openings they lead to.
 
     Centerlines that leave it at one place, within the radius of the branch, count as one branch.
     """
-    axis, left_mm = anatomy.parent.axis, []
+    axis, left = anatomy.parent.axis, list[tuple[float, tuple[str, ...]]]()
     ostia_mm: list[Floats] = []
-    for line in anatomy.vessel.centerlines:
+    names = [opening.role for opening in anatomy.vessel.far_ends]
+    for number, line in enumerate(anatomy.vessel.centerlines):
         foot_mm, distance_mm = curves.project(axis.points_mm, line.points_mm)
         is_away = distance_mm > np.interp(foot_mm, axis.abscissa_mm, anatomy.parent.section_radius_mm)
         is_gone = np.logical_and.accumulate(is_away[::-1])[::-1]
         first = np.argmax(is_gone)
         ostium_mm, radius_mm = line.points_mm[first], line.inscribed_radius_mm[first]
-        if is_gone[-1] and all(np.linalg.norm(ostium_mm - other_mm) > radius_mm for other_mm in ostia_mm):
+        if not is_gone[-1]:
+            continue
+        same = [k for k, other_mm in enumerate(ostia_mm) if np.linalg.norm(ostium_mm - other_mm) <= radius_mm]
+        if same:
+            left[same[0]] = left[same[0]][0], (*left[same[0]][1], *names[number : number + 1])
+        else:
             ostia_mm.append(ostium_mm)
-            left_mm.append(foot_mm[first])
-    return np.array(left_mm)
+            left.append((float(foot_mm[first]), tuple(names[number : number + 1])))
+    return tuple(left)
+
+
+def jailed_branches(anatomy: Anatomy, stents: Sequence[Stent]) -> tuple[str, ...]:
+    """Return the roles of the openings to which the branches lead that leave between the ends of any of the devices."""
+    jailed = {
+        role
+        for stent in stents
+        if not isinstance(stent.design, Basket)
+        for at_mm, roles in branches(on_path(anatomy, stent.path))
+        if stent.proximal_abscissa_mm <= at_mm <= stent.distal_abscissa_mm
+        for role in roles
+    }
+    return tuple(opening.role for opening in anatomy.vessel.far_ends if opening.role in jailed)
 
 
 def _branches(anatomy: Anatomy, stent: Stent) -> Measures:
     """Return the number of branches between the ends of the device, and each end's distance to the nearest branch."""
-    left_mm = branch_abscissas_mm(anatomy)
+    left_mm = np.array([at_mm for at_mm, _ in branches(anatomy)])
     first_mm, last_mm = stent.proximal_abscissa_mm, stent.distal_abscissa_mm
     found: Measures = {"jailed_branches_count": float(((left_mm >= first_mm) & (left_mm <= last_mm)).sum())}
     if len(left_mm):

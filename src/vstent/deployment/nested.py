@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from vstent.devices.stent import Stent
 from vstent.geometry.surface import Surface
 from vstent.kernels import curves
-from vstent.kernels.arrays import Floats, Ints
+from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.units import MM_PER_UM
 
 ROUNDS: Final = 10
@@ -21,11 +21,14 @@ SPARE_MM: Final = 0.001
 """Gap that is left between the wires of two devices, in mm."""
 
 
-def kept_inside(stent: Stent, redrawn: Callable[[Floats], Stent], outer: Sequence[Stent], artery: Surface) -> Stent:
+def kept_inside(
+    stent: Stent, redrawn: Callable[[Floats], Stent], outer: Sequence[Stent], artery: Surface, is_nested: Bools
+) -> Stent:
     """Return a device whose contour is moved inward where its wires would touch or pass those of outer devices.
 
     Nodes outside the artery, which occur in the narrow gap between its wall and a ramp, are put back first. `redrawn`
-    returns the device with another contour (rows, columns, 3).
+    returns the device with another contour (rows, columns, 3). Rows that are not in `is_nested` (rows,) are beyond a
+    cell of the others or beside them, and only kept off their wires.
     """
     points_mm = stent.nodes_mm.reshape(-1, 3)
     middles_mm = np.repeat(stent.nodes_mm.mean(axis=1), stent.nodes_mm.shape[1], axis=0)
@@ -34,25 +37,26 @@ def kept_inside(stent: Stent, redrawn: Callable[[Floats], Stent], outer: Sequenc
         wall_mm, _, face = artery.closest(points_mm)
         inside_mm = wall_mm - stent.design.wall_offset_um * MM_PER_UM * artery.normals[face]
         stent = redrawn(np.where(is_outside[:, None], inside_mm, points_mm).reshape(stent.nodes_mm.shape))
-    for _ in range(ROUNDS if outer else 0):
+    for done in range(ROUNDS if outer else 0):
         inward = stent.nodes_mm.mean(axis=1, keepdims=True) - stent.nodes_mm  # normals turn over where cells crumple
         inward /= curves.lengths(inward)[..., None]
         move_mm = np.zeros(inward.shape[0] * inward.shape[1])
         for other in outer:
-            node, depth_mm = _overlaps(stent, other, inward.reshape(-1, 3))
+            node, depth_mm = _overlaps(stent, other, inward.reshape(-1, 3), np.repeat(is_nested, inward.shape[1]))
             np.maximum.at(move_mm, node, depth_mm)
         if not move_mm.any():
             break
         move_mm = maximum_filter(move_mm.reshape(inward.shape[:2]), 3, mode=("nearest", "wrap"))
-        stent = redrawn(stent.nodes_mm + move_mm[..., None] * inward)
+        # Crowns that slide along a strut do not come free by the depth of their overlap alone.
+        stent = redrawn(stent.nodes_mm + (1 + done) * move_mm[..., None] * inward)
     return stent
 
 
-def _overlaps(stent: Stent, other: Stent, inward: Floats) -> tuple[Ints, Floats]:
+def _overlaps(stent: Stent, other: Stent, inward: Floats, is_nested: Bools) -> tuple[Ints, Floats]:
     """Return nodes (k,) of a device near overlaps with another one, and how far (k,) to move it there, in mm.
 
     `inward` (n, 3) are unit vectors at its nodes. Wires overlap where they cross as seen along these vectors and that
-    of the device is less than both radii further inward.
+    of the device is less than both radii further inward; at nodes that are not in `is_nested` (n,), where they touch.
     """
     (a, a_end, radius_a), (b, b_end, radius_b) = stent.pieces_mm, other.pieces_mm
     along_a, along_b = a_end - a, b_end - b
@@ -66,13 +70,15 @@ def _overlaps(stent: Stent, other: Stent, inward: Floats) -> tuple[Ints, Floats]
     between, u, v = a[i] - b[j], along_a[i], along_b[j]
     flat = tuple(vectors - np.einsum("kd,kd->k", vectors, normal)[:, None] * normal for vectors in (between, u, v))
     reach_mm, depth_mm = radius_a[i] + radius_b[j], np.zeros(len(i))
-    for vectors in (flat, (between, u, v)):
+    for is_asked, vectors in ((is_nested[node], flat), (True, (between, u, v))):
         share_a, share_b = _nearest(*vectors)
         apart_mm = between + share_a[:, None] * u - share_b[:, None] * v
         height_mm = np.einsum("kd,kd->k", apart_mm, normal)
         aside_mm2 = np.einsum("kd,kd->k", apart_mm, apart_mm) - height_mm**2
         rise_mm = np.sqrt(np.maximum(reach_mm**2 - aside_mm2, 0.0)) - height_mm
-        depth_mm = np.maximum(depth_mm, np.where((aside_mm2 < reach_mm**2) & (height_mm > -REACH_MM), rise_mm, 0.0))
+        depth_mm = np.maximum(
+            depth_mm, np.where(is_asked & (aside_mm2 < reach_mm**2) & (height_mm > -REACH_MM), rise_mm, 0.0)
+        )
     is_over = depth_mm > 0
     return node[is_over], depth_mm[is_over] + SPARE_MM
 

@@ -6,6 +6,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial import cKDTree
 
+from vstent.anatomy.restore.paths import on_path
 from vstent.deployment.contour import normals
 from vstent.devices.design import LaserCut
 from vstent.devices.stent import Stent
@@ -93,8 +94,9 @@ def over_restored(stent: Stent, anatomy: Anatomy) -> Stent:
 
 def is_over_restored(stent: Stent, anatomy: Anatomy, points_mm: Floats) -> Bools:
     """Return whether points (n, 3) on a stent lie over a neck or an ostium, or within one wire spacing of it."""
-    surface = anatomy.parent.landing_surface
-    closing = Surface(surface.vertices_mm, surface.faces[anatomy.parent.is_restored_face])
+    path = on_path(anatomy, stent.path).parent
+    surface = path.landing_surface
+    closing = Surface(surface.vertices_mm, surface.faces[path.is_restored_face])
     if not len(closing.faces):
         return np.zeros(len(points_mm), dtype=bool)
     return np.asarray(closing.closest(surface.closest(points_mm)[0])[1] < stent.spacing_mm)

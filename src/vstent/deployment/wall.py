@@ -89,14 +89,16 @@ class TreeWall(AbstractWall):
         return self.surface.crosses(starts_mm, ends_mm)
 
 
-def landing_wall(anatomy: Anatomy, inside: Sequence[Stent] = ()) -> tuple[TreeWall, Bools]:
+def landing_wall(
+    anatomy: Anatomy, inside: Sequence[Stent] = (), is_patient: Bools | None = None
+) -> tuple[TreeWall, Bools]:
     """Build the wall against which a device opens, and say which triangles of it are the patient's own.
 
     It is the landing surface. Where devices are already deployed, it is the inner face of the last of them instead, and
-    a ramp from its ends to the wall around them.
+    a ramp from its ends to the wall around them. `is_patient` (f,) says it for the landing surface, where not plain.
     """
     surface = anatomy.parent.landing_surface
-    is_patient = anatomy.parent.is_patient_face
+    is_patient = anatomy.parent.is_patient_face if is_patient is None else is_patient
     for stent in inside:
         rings_mm = _ramped(inner_nodes_mm(stent), surface)
         place_mm = curves.project(anatomy.parent.axis.points_mm, surface.corners_mm.mean(axis=1))[0]

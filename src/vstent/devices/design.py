@@ -20,6 +20,8 @@ Confidence = Literal["cited", "derived", "estimated"]
 """How sure a number of the catalogue is; see `Fact.confidence`."""
 STEEP_RAD = 0.1, 1.5
 """Smallest and largest angle between wire and axis at the free diameter, in rad."""
+DENSE_WIRES = 24
+"""Number of wires from which a braid is a flow diverter: they have 48 to 64, braids that hold coils 12 to 16."""
 Fraction = TypeVar("Fraction", float, np.ndarray)
 
 
@@ -169,6 +171,11 @@ class Braid:
         return sum(count for count, _ in self.wires)
 
     @property
+    def use(self) -> str:
+        """What it is for: ``flow diverter``, ``stent for coils`` or ``basket``."""
+        return "flow diverter" if self.n_wires >= DENSE_WIRES else "stent for coils"
+
+    @property
     def n_columns(self) -> int:
         """Columns of the lattice: one per wire."""
         return self.n_wires
@@ -255,7 +262,14 @@ class Basket(Braid):
 
     exponent: float = 2.0
     """Exponent p of the section: 2 of an ellipse, more of a barrel with flat ends."""
+    is_cup: bool = False
+    """Whether the free device is a flat disk of two layers, which opens in the sac as a cup with both of them below."""
     kind: Literal["braid", "basket"] = field(default="basket", init=False)
+
+    @property
+    def use(self) -> str:
+        """What it is for."""
+        return "basket"
 
     @property
     def marker_radius_mm(self) -> float:
@@ -295,6 +309,7 @@ class LaserCut:
     kind: Literal["laser_cut"] = field(default="laser_cut", init=False)
     """Device family."""
 
+    use = "stent for coils"
     follows_bends = False
     beyond_mm = 0.0
     layer_um = 0.0

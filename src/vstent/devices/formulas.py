@@ -58,7 +58,8 @@ def grid(design: Design, size: Size) -> Grid:
     """Return the grid of the contour: one node per lattice row and column, more where cells are large."""
     spacing_mm = float(row_spacing_mm(design, size, size.diameter_mm))
     if isinstance(design, Basket):
-        return Grid(round(rows_along(design, size, *meridian_mm(design, size))[-1]) + 1, design.n_columns, 1, 1)
+        rows = rows_along(design, size, *meridian_mm(design, size))[-1]
+        return Grid((2 * round(0.5 * rows) if design.is_cup else round(rows)) + 1, design.n_columns, 1, 1)
     rows = max(2, round(size.compacted_length_mm / spacing_mm) + 1) + 2 * _bare_rows(design, size)
     row_split = int(np.ceil(spacing_mm / NODE_SPACING_LIMIT_MM))
     column_split = int(np.ceil(np.pi * size.diameter_mm / design.n_columns / NODE_SPACING_LIMIT_MM))

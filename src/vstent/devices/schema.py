@@ -253,12 +253,15 @@ class _Basket(_Braid):
 
     kind: Literal["basket"]  # type: ignore[assignment]
     exponent: _Stated[_Positive]
+    cup: _Flag | None = None
+    """Whether it is a flat disk that opens as a cup."""
 
     def design(self) -> Design:
         """Return the basket."""
         wires = tuple((group.count.value, group.diameter_um.value) for group in self.wires)
         angle_rad, exponent = self.braid_angle_rad.value, self.exponent.value
-        return Basket(wires=wires, braid_angle_rad=angle_rad, exponent=exponent, **self.shared())
+        is_cup = self.cup is not None and self.cup.value
+        return Basket(wires=wires, braid_angle_rad=angle_rad, exponent=exponent, is_cup=is_cup, **self.shared())
 
 
 class _LaserCut(_Device):

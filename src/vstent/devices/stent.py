@@ -11,6 +11,7 @@ from vstent.devices.formulas import grid, mesh_nodes
 from vstent.devices.treatment import ANCHORS, Anchor
 from vstent.errors import LandingError
 from vstent.geometry.surface import Surface
+from vstent.geometry.vessel import PARENT
 from vstent.kernels import curves
 from vstent.kernels.arrays import Floats, Ints, freeze
 from vstent.units import MM_PER_UM
@@ -53,6 +54,8 @@ class Stent:
     crown_shift_mm: Floats = field(default_factory=lambda: np.zeros((2, 0, 0, 3)))
     """(2, lattice rows, lattice columns, 3) displacement of the crowns of the ring below and of the ring above from the
     node at which they would be joined, in mm; empty unless the device has open cells."""
+    path: str = PARENT
+    """Name of the path on which it lies; its arc lengths are on the axis of that path."""
 
     def __post_init__(self) -> None:
         freeze(self, "nodes_mm", np.float64, (-1, -1, 3))

@@ -1,7 +1,7 @@
 """Data classes of what is planned for a patient: `Placing`, `Implant` and `Treatment`."""
 
 import re
-from dataclasses import MISSING, dataclass
+from dataclasses import MISSING, dataclass, replace
 from typing import Final, Literal, get_args
 
 from vstent.errors import InputError
@@ -18,8 +18,21 @@ NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,59}")
 
 _NUMBER: Final = r"\d+(?:\.\d*)?"
 """Form of a number without a sign."""
-IMPLANT: Final = re.compile(rf"([\w-]+)(?:\s+({_NUMBER})\s*x\s*({_NUMBER}))?(?:\s*@\s*([+-]?{_NUMBER}))?")
-"""Form of an implant in the text of a treatment: device, label diameter x length in mm, @ shift in mm."""
+ARM_TO_ARM: Final = ">"
+"""Sign in the name of a path between its two ends, where it does not begin at the inlet."""
+FORK: Final = "fork"
+"""Shift of an implant that begins where its path has left the implants before it."""
+NESTED: Final = "+"
+"""Sign between implants of a treatment, each inside those before it."""
+SIDE_BY_SIDE: Final = "|"
+"""Sign between implants of a treatment that lie side by side."""
+AS_IF_ALONE: Final = "&"
+"""Sign between implants of a treatment that are deployed as if each were alone."""
+IMPLANT: Final = re.compile(
+    rf"([\w-]+)(?:\s+({_NUMBER})\s*x\s*({_NUMBER}))?(?:\s*((?:(?<=\s)\w+\s*)?>\s*\w+))?"
+    rf"(?:\s*@\s*([+-]?{_NUMBER}|{FORK}))?"
+)
+"""Form of an implant in the text of a treatment: device, diameter x length in mm, > path, @ shift in mm or fork."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +40,7 @@ class Placing:
     """Where an implant is placed; missing values are proposed."""
 
     path: str = "parent"
-    """Name of the path in `Anatomy.paths`."""
+    """Name of the path; see `vstent.anatomy.restore.paths`."""
     position_mm: float | None = setting(
         None,
         "center",
@@ -40,6 +53,10 @@ class Placing:
     """Point of the implant that lies there."""
     shift_mm: float = 0.0
     """Distance from the proposed position, in mm, positive distally; 0 where a position is given."""
+    at_fork: bool = False
+    """Whether its proximal end lies where its path has left the implants that are there before."""
+    beside: tuple[str, ...] = ()
+    """Paths of implants side by side with it, by name; each has its share of the artery."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +92,8 @@ class Implant:
     @property
     def is_proposed(self) -> bool:
         """Whether size and place are left to vstent."""
-        return self.diameter_mm is None and self.length_mm is None and self.placing == Placing(self.placing.path)
+        placing = Placing(self.placing.path, beside=self.placing.beside)
+        return self.diameter_mm is None and self.length_mm is None and self.placing == placing
 
 
 @dataclass(frozen=True)
@@ -127,13 +145,16 @@ def with_device(
 
 
 def read_treatment(text: str) -> Treatment:
-    """Return a treatment read from text; every implant opens inside those before it.
+    """Return a treatment read from text.
 
     Parameters
     ----------
-    text : devices in the order of their deployment, joined by ``+``, such as ``silk 4x20 + silk@-4``. After a device
-        may stand its label diameter and length in mm, and after ``@`` a shift of the proposed place in mm, positive
-        distally. ``NAME=`` before them names the treatment; otherwise its name is made of its devices.
+    text : devices in the order of their deployment, joined by ``+``, such as ``silk 4x20 + silk@-4``: each opens inside
+        those before it. After a device may stand its label diameter and length in mm, its path, such as
+        ``> outlet_2`` from the inlet or ``outlet_1 > outlet_2`` from one arm of a fork to the other, and after ``@`` a
+        shift of the proposed place in mm, positive distally, or ``fork``: it begins where its path has left the devices
+        before it. Devices joined by ``|`` lie side by side; those joined by ``&`` are deployed as if each were alone.
+        ``NAME=`` before them names the treatment; otherwise its name is made of its devices and paths.
 
     Raises
     ------
@@ -141,27 +162,46 @@ def read_treatment(text: str) -> Treatment:
         The text has another form.
     """
     given, equals, devices = text.rpartition("=")
+    signs = {sign for sign in (NESTED, SIDE_BY_SIDE, AS_IF_ALONE) if sign in devices}
+    if len(signs) > 1:
+        raise InputError(f"{text.strip()!r} joins devices in two ways: use only one of +, | and &")
+    sign = signs.pop() if signs else NESTED
     implants: list[Implant] = []
-    for part in devices.split("+"):
+    for part in devices.split(sign):
         found = IMPLANT.fullmatch(part.strip())
         if not found:
             raise InputError(
-                f"{part.strip()!r} is not an implant: write a device, its size and its shift such as 'silk 4x20 @-4'"
+                f"{part.strip()!r} is not an implant: write a device, its size, its path and its shift such as "
+                "'silk 4x20 > outlet_2 @-4'"
             )
-        device, diameter, length, shift = found.groups()
-        device = device.lower()
-        ids = (device, *(f"{device}_{number}" for number in range(2, len(implants) + 2)))
+        device, diameter, length, path, shift = found.groups()
+        device, path = device.lower(), re.sub(r"\s", "", path or "").removeprefix(ARM_TO_ARM)
+        first = "_".join([device, *path.split(ARM_TO_ARM)]) if path else device
+        ids = (first, *(f"{first}_{number}" for number in range(2, len(implants) + 2)))
         implants.append(
             Implant(
                 next(name for name in ids if name not in {one.id for one in implants}),
                 device,
                 float(diameter) if diameter else None,
                 float(length) if length else None,
-                Placing(shift_mm=float(shift or 0.0)),
-                tuple(one.id for one in implants),
+                Placing(
+                    path or Placing.path,
+                    shift_mm=0.0 if shift in (None, FORK) else float(shift),
+                    at_fork=shift == FORK,
+                ),
+                tuple(one.id for one in implants) if sign == NESTED else (),
             )
         )
-    name = given.strip() if equals else "+".join(one.id for one in implants)
+    if sign == SIDE_BY_SIDE:
+        paths = [one.placing.path for one in implants]
+        if len(set(paths)) < len(paths):
+            raise InputError(f"{text.strip()!r} places two devices of one path side by side: give each its path (>)")
+        implants = [
+            replace(one, placing=replace(one.placing, beside=tuple(path for path in paths if path != one.placing.path)))
+            for one in implants
+        ]
+    joined = {NESTED: "+", SIDE_BY_SIDE: "_beside_", AS_IF_ALONE: "_over_"}[sign]
+    name = given.strip() if equals else joined.join(one.id for one in implants)
     return Treatment(name, tuple(implants))
 
 

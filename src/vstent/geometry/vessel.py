@@ -7,7 +7,6 @@ from typing import Final
 
 import numpy as np
 
-from vstent.errors import InputError
 from vstent.geometry.surface import Surface
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Bools, Floats, freeze
@@ -244,7 +243,7 @@ class Path:
     """A way on which an implant is placed: an axis, and the surface against which the implant expands."""
 
     name: str
-    """``parent`` for the parent artery."""
+    """``parent`` for the parent artery; see `vstent.anatomy.restore.paths` for others."""
     axis: Centerline
     """Axis from the proximal to the distal end; its radius is the distance to the landing surface."""
     section_radius_mm: Floats
@@ -311,11 +310,3 @@ class Anatomy:
     def parent(self) -> Path:
         """The path along the parent artery."""
         return self.paths[0]
-
-    def path(self, name: str) -> Path:
-        """Return the path of a name; raise an InputError where there is none."""
-        for path in self.paths:
-            if path.name == name:
-                return path
-        known = ", ".join(path.name for path in self.paths)
-        raise InputError(f"This artery has no path {name!r}. Choose one of {known}.")

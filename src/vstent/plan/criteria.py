@@ -34,6 +34,7 @@ MEASURES: Final = (
     "max_wall_gap_mm",
     "malapposition_volume_mm3",
     "max_outside_mm",
+    "metal_in_artery_mm2",
     "metal_coverage_fraction",
     "metal_coverage_formula_fraction",
     "pore_density_per_mm2",
@@ -154,8 +155,8 @@ def read_criteria(path: Path) -> Criteria:
     return parse(text, str(path))
 
 
-def parse(text: str, name: str = "The file of criteria") -> Criteria:
-    """Read criteria from TOML text; `name` is the name of the file in messages.
+def parse(text: str, name: str = "The file of criteria", known: tuple[str, ...] = MEASURES) -> Criteria:
+    """Read criteria of known measures from TOML text; `name` is the name of the file in messages.
 
     An InputError says that the text is not TOML or breaks the schema, all weights are 0, or a measure does not exist.
     """
@@ -169,8 +170,8 @@ def parse(text: str, name: str = "The file of criteria") -> Criteria:
         raise InputError(f"{name} is wrong at {where}: {first['msg']}. Correct that entry.") from error
     if not any(item.weight > 0 for item in items):
         raise InputError(f"{name} gives no criterion a weight. Give at least one a weight above 0.")
-    for key in (item.key for item in items if item.key not in MEASURES):
-        near = difflib.get_close_matches(key, MEASURES, n=1)
-        hint = f"Did you mean {near[0]}?" if near else f"Choose one of: {', '.join(MEASURES)}."
+    for key in (item.key for item in items if item.key not in known):
+        near = difflib.get_close_matches(key, known, n=1)
+        hint = f"Did you mean {near[0]}?" if near else f"Choose one of: {', '.join(known)}."
         raise InputError(f"{name} uses {key}, which is not a number that is measured of a device. {hint}")
     return Criteria(tuple(items))

@@ -200,12 +200,17 @@ def _graded(common: tuple[Anatomy, Criteria], task: tuple[Design, Size, float]) 
 
 def graded_anew(candidate: Candidate, criteria: Criteria) -> Candidate:
     """Return a candidate with the grades, the score and the reason of its measures."""
-    asked = [item for item in criteria.of(candidate.design) if item.key in candidate.measures]
-    grades = {item.key: item.grade(float(candidate.measures[item.key])) for item in asked}
+    grades, score, reason = graded(criteria.of(candidate.design), candidate.measures)
+    return replace(candidate, grades=grades, score=score, is_suitable=all(grades.values()), reason=reason)
+
+
+def graded(items: Iterable[Criterion], measures: Measures) -> tuple[dict[str, float], float, str]:
+    """Return the grades of measures by key, the score from 0 to 1, and the reason in one sentence."""
+    asked = [item for item in items if item.key in measures]
+    grades = {item.key: item.grade(float(measures[item.key])) for item in asked}
     weight = sum(item.weight for item in asked)
     score = sum(item.weight * grades[item.key] for item in asked) / weight if weight else 0.0
-    reason = _reason(asked, grades, candidate.measures)
-    return replace(candidate, grades=grades, score=score, is_suitable=all(grades.values()), reason=reason)
+    return grades, score, _reason(asked, grades, measures)
 
 
 def ordered(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from vstent.anatomy.landing_zones import neck_span_mm
+from vstent.anatomy.restore.paths import on_path
 from vstent.deployment.sketch import measured_wall, sketch
 from vstent.devices.design import Basket, Design, Size, widest_mm
 from vstent.devices.stent import Deployment, Landing, Stent, tube_faces
@@ -244,7 +245,8 @@ def mesh_layers(nodes_mm: Floats) -> tuple[MeshLayer, LineLayer]:
 def _expansion(name: str, number: int, deployed: Mapping[str, Deployment], anatomy: Anatomy, scene: Scene) -> Plate:
     """Return the picture of the expansion of one implant of a treatment, colored by the gap to the wall."""
     key, deployment = list(deployed.items())[number]
-    frames_mm, gaps_mm = thin_frames(deployment, anatomy.parent.landing_surface, FRAMES)
+    wall = on_path(anatomy, deployment.stent.path).parent.landing_surface
+    frames_mm, gaps_mm = thin_frames(deployment, wall, FRAMES)
     contour = [layer for layer in scene.pick(("contour",), name) if isinstance(layer, MeshLayer)][number]
     reached = np.concatenate([[0.0], deployment.terminated_fraction])
     shots = []

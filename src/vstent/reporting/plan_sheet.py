@@ -7,6 +7,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from vstent.anatomy.landing_zones import ZONE_MM, neck_span_mm
+from vstent.anatomy.restore.paths import on_path
 from vstent.devices.design import Basket
 from vstent.devices.stent import Deployment, Stent
 from vstent.geometry.vessel import Anatomy
@@ -132,6 +133,7 @@ def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str,
         ("Device and label size", f"{stent.design.name} {stent.size.label}"),
         ("Deployed length", f"{stent.deployed_length_mm:.1f} mm {ends(metrics, 'deployed_length_mm')}".rstrip()),
     ]
+    anatomy = on_path(anatomy, stent.path)
     first_mm, last_mm = anatomy.parent.own_mm
     proximal_mm, distal_mm = neck_span_mm(anatomy)
     zones_mm = {

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
+from vstent.anatomy.restore.paths import on_path
 from vstent.deployment.coverage import coverage_fractions
 from vstent.devices.stent import Deployment, Stent
 from vstent.devices.treatment import BARE
@@ -268,7 +269,8 @@ def closed_layer(name: str, rings: Iterable[Floats], radius_mm: float, colour: t
 
 def contour_layer(name: str, deployment: Deployment, anatomy: Anatomy) -> MeshLayer:
     """Return the contour of a device with its expansion over time, colored by its gap to the wall."""
-    frames_mm, gaps_mm = thin_frames(deployment, anatomy.parent.landing_surface, n_frames=24)
+    wall = on_path(anatomy, deployment.stent.path).parent.landing_surface
+    frames_mm, gaps_mm = thin_frames(deployment, wall, n_frames=24)
     return MeshLayer(
         "contour",
         name,

@@ -112,7 +112,9 @@ class Settings:
         (with_device("silk"), with_device("enterprise")),
         "treatment",
         "treatment of several devices in the order of their deployment, each inside those before it, such as "
-        "'silk 4x20 + silk@-4': with a size, or with a shift of the proposed place in mm; NAME= before it names it",
+        "'silk 4x20 + silk@-4': with a size, a path, or a shift of the proposed place in mm; "
+        "'enterprise > outlet_1 + enterprise > outlet_2' is a Y at a fork, | in place of + places them side by side; "
+        "NAME= before it names it",
         read_treatment,
         metavar="TEXT",
         separators=";",

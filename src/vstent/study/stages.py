@@ -14,12 +14,14 @@ import numpy as np
 from vstent.anatomy.morphology import Measures, morphology
 from vstent.anatomy.openings import opening_at
 from vstent.anatomy.read import read_vessel
+from vstent.anatomy.restore.paths import on_path
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
 from vstent.deployment.coverage import together
 from vstent.deployment.deploy import deploy, propose_landing, propose_size
-from vstent.deployment.measure import measure
+from vstent.deployment.forks import beyond_mm
+from vstent.deployment.measure import jailed_branches, measure
 from vstent.devices.catalogue import find_design, find_sizes
 from vstent.devices.design import Basket, Size
 from vstent.devices.ranges import how_sure
@@ -40,6 +42,7 @@ from vstent.io.files import is_surface_file
 from vstent.io.images import read_image
 from vstent.kernels.arrays import Floats
 from vstent.plan.bands import bands
+from vstent.plan.treatments import rank_treatments
 from vstent.plan.uncertainty import Uncertainty, vary
 from vstent.study.folder import flow_folder
 from vstent.study.keys import ANATOMY, VESSEL, stage_name
@@ -202,15 +205,18 @@ def deploy_implant(implant: Implant, anatomy: Anatomy, inside: Sequence[Stent] =
     """Deploy an implant in the given or proposed size and place, inside implants that are there in this order."""
     anatomy = on_path(anatomy, implant.placing.path)
     size = size_of(implant, anatomy)
-    landing = landing_of(implant, anatomy, size)
-    return deploy(find_design(implant.device), anatomy, size=size, landing=landing, inside=inside)
+    landing = landing_of(implant, anatomy, size, inside)
+    design, beside = find_design(implant.device), implant.placing.beside
+    return deploy(design, anatomy, size=size, landing=landing, inside=inside, beside=beside)
 
 
-def landing_of(implant: Implant, anatomy: Anatomy, size: Size) -> Landing | None:
+def landing_of(implant: Implant, anatomy: Anatomy, size: Size, inside: Sequence[Stent] = ()) -> Landing | None:
     """Return the given place of an implant on the first path, or the proposed one shifted; None where none is given."""
     placing = implant.placing
     if placing.position_mm is not None:
         return Landing(placing.position_mm, placing.anchor)
+    if placing.at_fork:
+        return Landing(beyond_mm(anatomy.parent, inside), "proximal")
     if not placing.shift_mm:
         return None
     design = find_design(implant.device)
@@ -218,12 +224,6 @@ def landing_of(implant: Implant, anatomy: Anatomy, size: Size) -> Landing | None
         return Landing(placing.shift_mm, "proximal")
     proposed = propose_landing(design, anatomy, size)
     return replace(proposed, abscissa_mm=proposed.abscissa_mm + placing.shift_mm)
-
-
-def on_path(anatomy: Anatomy, name: str) -> Anatomy:
-    """Return the anatomy with a path in the first place, where implants are deployed."""
-    path = anatomy.path(name)
-    return replace(anatomy, paths=(path, *(other for other in anatomy.paths if other is not path)))
 
 
 def size_of(implant: Implant, anatomy: Anatomy) -> Size:
@@ -351,6 +351,7 @@ def vary_all(
 
             with store.stage(stage) as tell:
                 begun = store.unfinished(stage, keys[stage])
+                anatomy = on_path(anatomy, deployment.stent.path)
                 varied = vary(anatomy, deployment, settings.uncertainty, flow=flow, progress=told, checkpoint=begun)
                 tell(f"{len(varied.points)} deployments; {varied.n_failed} of them did not fit.")
             store.save(stage, keys[stage], varied)
@@ -370,9 +371,7 @@ def measure_study(
     shapes = sac_surfaces(anatomy) if fields else ()
     treatments: dict[str, dict[str, Any]] = {BARE: {}} if fields else {}
     for name, deployed in implants.items():
-        treatments[name] = {"implants": {id_: measure(anatomy, one) for id_, one in deployed.items()}}
-        if len(deployed) > 1:
-            treatments[name]["together"] = together(anatomy, [one.stent for one in deployed.values()])
+        treatments[name] = measure_treatment(anatomy, deployed)
     if fields:
         case = flow_case(anatomy, (), settings.flow)
     for name, field in fields.items():
@@ -398,7 +397,20 @@ def measure_study(
     for name, spread in varied.items():
         treatments[name]["uncertainty"] = spread
     metrics = {"vessel": morphology(anatomy), "treatments": treatments}
+    ranked = rank_treatments(treatments)
+    if len(ranked) > 1:
+        metrics["ranking"] = ranked
     return metrics | ({"failures": dict(failures)} if failures else {})
+
+
+def measure_treatment(anatomy: Anatomy, deployed: Mapping[str, Deployment]) -> dict[str, Any]:
+    """Return the metrics of deployed implants, each and together, and the openings of the branches that they jail."""
+    stents = [one.stent for one in deployed.values()]
+    found: dict[str, Any] = {
+        "implants": {id_: measure(anatomy, one) for id_, one in deployed.items()},
+        "jailed_branches": list(jailed_branches(anatomy, stents)),
+    }
+    return found | ({"together": together(anatomy, stents)} if len(stents) > 1 else {})
 
 
 def neck_notes(metrics: Mapping[str, Any]) -> tuple[str, ...]:
@@ -422,7 +434,7 @@ def bands_of(anatomy: Anatomy, deployment: Deployment, measures: Measures, impla
     The band of the proposed size is among them where the implant has no given size.
     """
     is_proposed = implant.diameter_mm is None and implant.length_mm is None
-    found = bands(anatomy, deployment, measures, is_proposed=is_proposed)
+    found = bands(on_path(anatomy, deployment.stent.path), deployment, measures, is_proposed=is_proposed)
     return found.metrics() | {"device": how_sure(deployment.stent.design)}
 
 

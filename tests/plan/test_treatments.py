@@ -1,0 +1,69 @@
+"""Treatments are ranked by their flows, with the branches that they jail by name."""
+
+import json
+
+import pytest
+from forks import arm, fork
+
+from vstent.deployment.deploy import deploy
+from vstent.deployment.measure import branches, jailed_branches, measure
+from vstent.devices.catalogue import find_design, find_size
+from vstent.plan.treatments import MEASURES, rank_treatments, treatment_criteria
+
+
+def treatment(velocity, inflow, coverage=0.3, metal=20.0, jailed=None, **other):
+    """The metrics of a treatment with these changes of its flow."""
+    change = {"mean_sac_velocity_m_s_ratio": 1 + velocity, "neck_inflow_mL_s_ratio": 1 + inflow}
+    change |= {f"{role}_flow_mL_s_ratio": 1 + lost for role, lost in (jailed or {}).items()}
+    implant = {"neck_metal_coverage_fraction": coverage, "metal_in_artery_mm2": metal}
+    return {"implants": {"a": implant}, "change": change, "jailed_branches": list(jailed or {})} | other
+
+
+def test_every_criterion_has_a_measure_a_source_and_words():
+    items = treatment_criteria().items
+    assert [item.key for item in items] == list(MEASURES)
+    assert all(len(item.source) > 20 for item in items)
+
+
+def test_the_score_is_the_weighted_mean_of_the_grades():
+    full, half = treatment(-0.8, -0.7), treatment(-0.33, -0.33, coverage=0.15, metal=135.0)
+    first, second = rank_treatments({"bare": {"flow": {}}, "half": half, "full": full})
+    assert (first["treatment"], first["score"]) == ("full", 1.0)
+    assert (second["treatment"], second["score"]) == ("half", pytest.approx(0.5))
+    assert first["reason"] == "Meets almost every criterion in full."
+    assert "mean velocity in the sac -33% (-19)" in second["reason"]
+
+
+def test_a_branch_that_loses_flow_is_named_and_counts():
+    spared = treatment(-0.5, -0.5, jailed={"outlet_2": 0.02, "outlet_3": -0.01})
+    robbed = treatment(-0.5, -0.5, jailed={"outlet_2": 0.02, "outlet_3": -0.30})
+    closed = treatment(-0.9, -0.9, jailed={"outlet_3": -0.6})
+    rows = rank_treatments({"closed": closed, "robbed": robbed, "spared": spared})
+    assert [row["treatment"] for row in rows] == ["spared", "robbed", "closed"]
+    assert rows[1]["jailed_branches"] == {"outlet_2": pytest.approx(0.02), "outlet_3": pytest.approx(-0.3)}
+    assert rows[1]["worst_branch_change_fraction"] == pytest.approx(-0.3)
+    assert not rows[2]["is_suitable"]
+    assert rows[2]["reason"] == "Ruled out: flow of the most affected jailed branch -60%."
+
+
+def test_several_implants_count_with_all_their_metal_and_their_common_coverage():
+    two = treatment(-0.5, -0.5, together={"neck_union_coverage_fraction": 0.4})
+    two["implants"]["b"] = two["implants"]["a"]
+    (row,) = rank_treatments({"two": two})
+    assert (row["neck_coverage_fraction"], row["metal_in_artery_mm2"]) == (0.4, 40.0)
+    json.dumps(row)
+
+
+def test_a_treatment_without_a_flow_is_left_out():
+    assert rank_treatments({"a": {"implants": {}, "jailed_branches": []}}) == []
+
+
+def test_a_stent_over_a_fork_jails_the_other_arm_by_name_and_its_metal_is_that_of_its_wires():
+    enterprise = find_design("enterprise")
+    done = deploy(enterprise, arm("outlet_1"), size=find_size(enterprise, length_mm=22.0))
+    ((_, roles),) = branches(arm("outlet_1"))
+    assert roles == jailed_branches(fork(), [done.stent]) == ("outlet_2",)
+    across = deploy(enterprise, arm("outlet_1>outlet_2"), size=find_size(enterprise, length_mm=22.0))
+    assert set(jailed_branches(fork(), [across.stent])) <= {"outlet_1", "outlet_2"}
+    area_mm2 = done.stent.wire_length_mm * 0.078
+    assert measure(fork(), done)["metal_in_artery_mm2"] == pytest.approx(area_mm2)
