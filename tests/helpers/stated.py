@@ -36,11 +36,12 @@ STATED = {
     "length": ("20", Settings(treatments=tuple(with_device(one, length_mm=20.0) for one in USUAL))),
     "center": ("-2", Settings(treatments=tuple(with_device(one, center_mm=-2.0) for one in USUAL))),
     "no-flow": ("yes", Settings(flow=None)),
-    "flow-rate": ("4.5", Settings(flow=FlowSettings(inflow_mL_s=4.5))),
+    "inlet-speed": ("0.3", Settings(flow=FlowSettings(inlet_speed_m_s=0.3))),
+    "flow-rate": ("270 mL/min", Settings(flow=FlowSettings(inflow_mL_s=4.5))),
     "density": ("1050", Settings(flow=FlowSettings(blood=Blood(1050.0)))),
     "viscosity": ("0.0035", Settings(flow=FlowSettings(blood=Blood(viscosity_Pa_s=0.0035)))),
     "shear-thinning": ("yes", Settings(flow=FlowSettings(blood=Blood(1060.0, 0.00345, CarreauYasuda())))),
-    "pulsatile": ("published", Settings(flow=FlowSettings(waveform=OLDER_ADULT_ICA))),
+    "pulsatile": ("ica_older_adults", Settings(flow=FlowSettings(waveform=OLDER_ADULT_ICA))),
     "steady": ("yes", Settings()),
     "outlets": ("murray", Settings(flow=FlowSettings(outlets="murray"))),
     "inlet-profile": ("plug", Settings(flow=FlowSettings(profile="plug"))),
@@ -69,5 +70,5 @@ STATED = {
 def needed(option: str) -> dict[str, object]:
     """What must be given for an option to have an effect, as values of options."""
     if option == "steady":
-        return {"pulsatile": "published"}
+        return {"pulsatile": "ica_older_adults"}
     return {"uncertainty": 8} if option.startswith(("vary", "uncertainty-")) else {}

@@ -7,7 +7,11 @@ from typing import Final, TypeAlias
 import numpy as np
 
 from vstent.errors import InputError
-from vstent.flow.settings import FlowSettings, Profile
+from vstent.flow.measured import MeasuredProfile, Profile
+from vstent.flow.profile import developed_profile, plug_profile, pulsating_profiles
+from vstent.flow.registration import harmonics_of, registered
+from vstent.flow.settings import Blood, FlowSettings
+from vstent.flow.waveform import Waveform
 from vstent.geometry.vessel import Opening, Vessel, murray_shares
 from vstent.kernels.arrays import Complex, Floats
 from vstent.units import PA_PER_MMHG, counted
@@ -26,8 +30,37 @@ class Inflow:
     """Mean flow rate in."""
     source: str = ""
     """Where it comes from, for a user; empty: it was given."""
-    profile: Profile = "developed"
-    """Velocity profile."""
+    profile: Profile | MeasuredProfile = "developed"
+    """Velocity profile. A measured one over a cycle has the waveform of the case."""
+
+    @property
+    def is_pulsating(self) -> bool:
+        """Whether the profile changes its shape over a cycle."""
+        profile = self.profile
+        return profile == "womersley" if isinstance(profile, str) else profile.period_s is not None
+
+    def relative_velocity(self, section_mm: Floats, normal: Floats, points_mm: Floats) -> Floats:
+        """Return the velocity over its mean (n, 3) in a section (k, 3) at points (n, 3), averaged over the cycle."""
+        section = section_mm, normal, points_mm
+        if isinstance(self.profile, MeasuredProfile):
+            return registered(self.profile.section, *section).mean(axis=0)
+        profile = plug_profile if self.profile == "plug" else developed_profile
+        return np.asarray(-profile(*section)[:, None] * normal)
+
+    def pulsating_velocity(
+        self, pulse: Waveform, blood: Blood, time_s: Floats, section_mm: Floats, normal: Floats, points_mm: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return the velocity over its mean at points (n, 3): its average (n, 3), and (t, n, 3) at times (t,)."""
+        section = section_mm, normal, points_mm
+        rate_per_s, amplitude = pulse.harmonics
+        if isinstance(self.profile, MeasuredProfile):
+            steady, waves = harmonics_of(registered(self.profile.section, *section), len(rate_per_s))
+        else:
+            steady = self.relative_velocity(*section)
+            speed = amplitude[:, None] * pulsating_profiles(*section, rate_per_s, blood.kinematic_viscosity_m2_s)
+            waves = -speed[..., None] * normal
+        turned = np.exp(1j * np.outer(time_s, rate_per_s))
+        return steady, steady + np.tensordot(turned, waves, 1).real
 
 
 @dataclass(frozen=True)
@@ -93,10 +126,7 @@ def ends_of(vessel: Vessel, settings: FlowSettings) -> tuple[End, ...]:
     outlets have fixed shares, all but the widest get a flow rate, and the widest has zero pressure and takes the rest.
     """
     inlets, outlets = vessel.inlets, vessel.outlets
-    inflow_mL_s = MEAN_INLET_SPEED_M_S * np.array([inlet.area_mm2 for inlet in inlets])
-    if settings.inflow_mL_s is not None:
-        inflow_mL_s = settings.inflow_mL_s * murray_shares(inlets)
-    source = ASSUMED if settings.inflow_mL_s is None else ""
+    inflow_mL_s, source = _inflow(inlets, settings)
     entering = [Inflow(mean_mL_s, source, settings.profile) for mean_mL_s in inflow_mL_s.tolist()]
     if settings.shares is not None and settings.outlets in ("zero_pressure", "murray"):
         raise InputError(
@@ -113,6 +143,24 @@ def ends_of(vessel: Vessel, settings: FlowSettings) -> tuple[End, ...]:
     compliant = settings.compliance_time_s, settings.proximal_fraction
     stored = compliant if settings.outlets == "windkessel" else ()
     return (*entering, *(Resistance(mean_mL_s, pressure_Pa, *stored) for mean_mL_s in outflow_mL_s))
+
+
+def _inflow(inlets: Sequence[Opening], settings: FlowSettings) -> tuple[Floats, str]:
+    """Return the flow rate (i,) through every inlet, and where it comes from."""
+    profile, speed_m_s = settings.profile, settings.inlet_speed_m_s
+    is_given = settings.inflow_mL_s is not None or speed_m_s is not None
+    by_speed_mL_s = (speed_m_s or MEAN_INLET_SPEED_M_S) * np.array([inlet.area_mm2 for inlet in inlets])
+    given_mL_s = by_speed_mL_s if settings.inflow_mL_s is None else settings.inflow_mL_s * murray_shares(inlets)
+    if not isinstance(profile, MeasuredProfile):
+        return given_mL_s, "" if is_given else ASSUMED
+    if len(inlets) > 1:
+        raise InputError("a measured profile belongs to one inlet, and this vessel has several: give one of the words")
+    if settings.waveform not in (None, profile.waveform) and profile.period_s is not None:
+        raise InputError(
+            "the inlet profile has times, and another waveform is given: leave out --pulsatile or the times"
+        )
+    measured_mL_s = np.array([profile.section.flow_mL_s.mean()])
+    return given_mL_s if is_given else measured_mL_s, profile.section.described(inlets[0].normal)
 
 
 def _shares(outlets: Sequence[Opening], settings: FlowSettings) -> Floats:

@@ -6,8 +6,9 @@ This module imports no numpy, so that command-line options and settings of a stu
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
-from vstent.fields import Limits, flag, numbers, setting, whole
-from vstent.flow.waveform import PUBLISHED, Waveform, read_waveform
+from vstent.fields import Limits, flag, flow_rate, numbers, setting, whole
+from vstent.flow.measured import MeasuredProfile, Profile, read_profile
+from vstent.flow.waveform import PUBLISHED, SOURCES, Waveform, read_waveform
 
 if TYPE_CHECKING:
     from vstent.kernels.arrays import Floats
@@ -16,8 +17,6 @@ Outlets = Literal["zero_pressure", "murray", "split", "resistance", "windkessel"
 """Condition at the outlets."""
 RESISTING: Final = ("resistance", "windkessel")
 """Conditions with which the flow out follows the pressure."""
-Profile = Literal["developed", "plug", "womersley"]
-"""Velocity profile at the inlets."""
 LATTICE: Final = "lattice_boltzmann"
 """Name of the embedded lattice-Boltzmann engine."""
 OPENFOAM: Final = "openfoam"
@@ -147,30 +146,47 @@ class FlowSettings:
     inflow_mL_s: float | None = setting(
         None,
         "flow-rate",
-        "mean inflow of all inlets",
-        limits=Limits("mL/s", above=0.0, high=50.0, remark="240 mL/min are 4 mL/s"),
+        "mean inflow of all inlets, such as '245 mL/min', '4.1 mL/s' or '0.27 m/s'; without a unit",
+        flow_rate,
+        Limits("mL/s", above=0.0, high=50.0, remark="240 mL/min are 4 mL/s"),
         usual="assumed: 0.27 m/s times their area, as in VaMPy",
+        short="--inflow",
     )
-    """Mean flow rate through all inlets together; None: 0.27 m/s times the area of each inlet."""
-    profile: Profile = setting(
+    """Mean flow rate through all inlets together; None: that of `inlet_speed_m_s`."""
+    inlet_speed_m_s: float | None = setting(
+        None,
+        "inlet-speed",
+        "mean speed in every inlet, in place of --flow-rate",
+        limits=Limits("m/s", above=0.0, high=2.0, remark="27 cm/s are 0.27 m/s"),
+        usual="0.27",
+    )
+    """Mean speed in every inlet, where no flow rate is given; None: the flow that a measured profile has, or an assumed
+    speed of 0.27 m/s."""
+    profile: Profile | MeasuredProfile = setting(
         "developed",
         "inlet-profile",
-        "velocity profile at the inlets: fully developed, plug (uniform), or that of a pulse in a long straight artery "
-        "(womersley)",
+        "velocity profile at the inlets: fully developed (developed), uniform (plug), that of a pulse in a long "
+        "straight artery (womersley), or a measured one: a CSV file with columns x, y, z (mm), u, v, w (m/s)",
         str,
         choices=get_args(Profile),
+        metavar="WORD|CSV",
+        load=read_profile,
+        is_file=True,
     )
-    """Velocity profile at every inlet; that of Womersley is the developed one in steady flow."""
+    """Velocity profile at every inlet; that of Womersley is the developed one in steady flow. A measured one needs a
+    single inlet."""
     blood: Blood = Blood()
     """The fluid."""
     waveform: Waveform | None = setting(
         None,
         "pulsatile",
-        "pulsatile inflow: a CSV file with columns time (s) and flow (any unit); without a file the published waveform "
-        "of the internal carotid artery (Hoi et al. 2010)",
+        "pulsatile inflow: a CSV file with columns time (s) and flow (any unit), or the name of a published waveform: "
+        + "; ".join(f"{name} ({source})" for name, source in SOURCES.items()),
         str,
-        metavar="CSV",
+        metavar="NAME|CSV",
+        choices=tuple(SOURCES),
         alone=PUBLISHED,
+        short="--waveform",
         load=read_waveform,
         is_file=True,
         off=("steady", "constant mean inflow (the default)"),

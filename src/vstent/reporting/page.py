@@ -192,7 +192,7 @@ def limits_of(case: "CaseResult") -> tuple[str, ...]:
     limits = [OF_CONTOUR, f"{blood}, and the wall is rigid; {AT_OUTLETS[flow['outlets']]}."]
     if flow["numerics"]["engine"] in OF_DEVICE:
         limits.append(OF_DEVICE[flow["numerics"]["engine"]])
-    if flow["inflow_mL_s"] is None:
+    if flow["inflow_mL_s"] is flow["inlet_speed_m_s"] is None and isinstance(flow["profile"], str):
         limits.append(f"The inflow is {ASSUMED}, times the area of every inlet. It was not measured in the patient.")
     if len(case.anatomy.vessel.inlets) > 1:
         limits.append(AT_INLETS)
