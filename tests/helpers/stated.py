@@ -9,6 +9,8 @@ from vstent.study.settings import AnatomySettings, InputSettings, Settings
 USUAL = ("silk", "enterprise")
 NECK = "1,2,3\n4,5,6\n7,8,9\n"
 """Content of the file ``neck.csv``."""
+OUTLETS = "R_p (Pa s/m3), C (m3/Pa), R_d\n6e8,1e-9,9e8\n"
+"""Content of the file ``outlets.csv``."""
 STATED = {
     "units": ("cm", Settings(InputSettings(units="cm"))),
     "frame": ("ras", Settings(InputSettings(frame="ras"))),
@@ -46,6 +48,7 @@ STATED = {
     "outlets": ("murray", Settings(flow=FlowSettings(outlets="murray"))),
     "inlet-profile": ("plug", Settings(flow=FlowSettings(profile="plug"))),
     "outlet-shares": ("3, 2, 1", Settings(flow=FlowSettings(shares=(3.0, 2.0, 1.0)))),
+    "outlet-table": ("outlets.csv", Settings(flow=FlowSettings(elements=((600.0, 0.001, 900.0),)))),
     "outlet-exponent": ("2", Settings(flow=FlowSettings(outlet_exponent=2.0))),
     "mean-pressure": ("100", Settings(flow=FlowSettings(mean_pressure_mmHg=100.0))),
     "windkessel-time": ("0.5", Settings(flow=FlowSettings(compliance_time_s=0.5))),

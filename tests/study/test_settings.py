@@ -7,7 +7,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 
 import pytest
-from stated import NECK, STATED, needed
+from stated import NECK, OUTLETS, STATED, needed
 
 from vstent.app.choices import Choices
 from vstent.cli import options
@@ -69,6 +69,7 @@ def test_every_setting_has_an_option_or_a_reason_against_it() -> None:
 @pytest.mark.parametrize("name", STATED)
 def test_an_option_of_the_command_line_reaches_its_setting(name: str, tmp_path: Path) -> None:
     (tmp_path / "neck.csv").write_text(NECK)
+    (tmp_path / "outlets.csv").write_text(OUTLETS)
     text, expected = STATED[name]
     option = OPTIONS.get(name, Option(name, "", flag))
     if option.is_file and text not in option.choices:

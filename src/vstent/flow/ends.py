@@ -1,16 +1,17 @@
 """Boundary conditions at the openings of a vessel, and what the settings' word for the outlets means."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 import numpy as np
 
 from vstent.errors import InputError
+from vstent.flow.forks import shares_by_forks
 from vstent.flow.measured import MeasuredProfile, Profile
 from vstent.flow.profile import developed_profile, plug_profile, pulsating_profiles
 from vstent.flow.registration import harmonics_of, registered
-from vstent.flow.settings import Blood, FlowSettings
+from vstent.flow.settings import RESISTING, Blood, FlowSettings
 from vstent.flow.waveform import Waveform
 from vstent.geometry.vessel import Opening, Vessel, murray_shares
 from vstent.kernels.arrays import Complex, Floats
@@ -128,17 +129,21 @@ def ends_of(vessel: Vessel, settings: FlowSettings) -> tuple[End, ...]:
     inlets, outlets = vessel.inlets, vessel.outlets
     inflow_mL_s, source = _inflow(inlets, settings)
     entering = [Inflow(mean_mL_s, source, settings.profile) for mean_mL_s in inflow_mL_s.tolist()]
-    if settings.shares is not None and settings.outlets in ("zero_pressure", "murray"):
-        raise InputError(
-            f"shares of the outlets have no effect with --outlets {settings.outlets}: choose split, resistance or "
-            "windkessel"
-        )
+    for word, given, usable in (
+        ("shares", settings.shares, ("split", *RESISTING)),
+        ("a table", settings.elements, RESISTING),
+    ):
+        if given is not None and settings.outlets not in usable:
+            choice = f"{', '.join(usable[:-1])} or {usable[-1]}"
+            raise InputError(f"{word} of the outlets have no effect with --outlets {settings.outlets}: choose {choice}")
     if settings.outlets == "zero_pressure":
         return (*entering, *(Pressure() for _ in outlets))
-    shares = murray_shares(outlets) if settings.outlets == "murray" else _shares(outlets, settings)
+    shares = murray_shares(outlets) if settings.outlets == "murray" else _shares(vessel, settings)
     outflow_mL_s = (inflow_mL_s.sum() * shares).tolist()
     if settings.outlets in ("murray", "split"):
         return (*entering, Pressure(), *map(FlowRate, outflow_mL_s[1:]))
+    if settings.elements is not None:
+        return (*entering, *_tabled(outlets, settings, float(inflow_mL_s.sum())))
     pressure_Pa = PA_PER_MMHG * settings.mean_pressure_mmHg
     compliant = settings.compliance_time_s, settings.proximal_fraction
     stored = compliant if settings.outlets == "windkessel" else ()
@@ -163,17 +168,32 @@ def _inflow(inlets: Sequence[Opening], settings: FlowSettings) -> tuple[Floats, 
     return given_mL_s if is_given else measured_mL_s, profile.section.described(inlets[0].normal)
 
 
-def _shares(outlets: Sequence[Opening], settings: FlowSettings) -> Floats:
-    """Return the share (k,) of every outlet: as given, or by diameter."""
-    parts = np.array([outlet.diameter_mm for outlet in outlets]) ** settings.outlet_exponent
-    if settings.shares is not None:
-        if len(settings.shares) != len(outlets):
-            raise InputError(
-                f"{counted(len(settings.shares), 'share')} of the flow for {counted(len(outlets), 'outlet')}: give one "
-                "for each outlet, the widest first (--outlet-shares)"
-            )
-        parts = np.array(settings.shares)
-    return np.asarray(parts / parts.sum())
+def _shares(vessel: Vessel, settings: FlowSettings) -> Floats:
+    """Return the share (k,) of every outlet: as given, or by the diameters at every fork."""
+    if settings.shares is None:
+        return shares_by_forks(vessel, settings.outlet_exponent)
+    _check_count(vessel.outlets, len(settings.shares), "share", "--outlet-shares")
+    return np.array(settings.shares) / sum(settings.shares)
+
+
+def _tabled(outlets: Sequence[Opening], settings: FlowSettings, inflow_mL_s: float) -> Iterator[Resistance]:
+    """Yield the resistance or Windkessel of every outlet in a table."""
+    elements = settings.elements or ()
+    _check_count(outlets, len(elements), "row", "--outlet-table")
+    pressure_Pa = inflow_mL_s / sum(1 / (proximal + distal) for proximal, _, distal in elements)
+    for proximal, compliance, distal in elements:
+        whole = proximal + distal
+        stored = (whole * compliance, proximal / whole) if settings.outlets == "windkessel" else (0.0, 1.0)
+        yield Resistance(pressure_Pa / whole, pressure_Pa, *stored, whole)
+
+
+def _check_count(outlets: Sequence[Opening], count: int, what: str, option: str) -> None:
+    """Raise InputError where there are not as many values as outlets."""
+    if count != len(outlets):
+        raise InputError(
+            f"{counted(count, what)} for {counted(len(outlets), 'outlet')}: give one for each outlet, the widest first "
+            f"({option})"
+        )
 
 
 def outflows(
