@@ -41,8 +41,8 @@ AT_OUTLETS: Final = {
     "zero_pressure": "the pressure at the outlets is assumed, not measured in the patient",
     "murray": "the flow is split among the outlets by their diameter cubed, not measured in the patient",
     "split": "the shares of the outlets in the flow are assumed, unless they were measured in the patient",
-    "resistance": "the resistance downstream of every outlet is assumed, unless it is from a table, not measured in the patient",
-    "windkessel": "the Windkessel downstream of every outlet is assumed, unless it is from a table, not measured in the patient",
+    "resistance": "the resistance downstream of every outlet is assumed, unless a table states it",
+    "windkessel": "the Windkessel downstream of every outlet is assumed, unless a table states it",
 }
 """Limit that a report states, by the outlet setting of the flow."""
 SHOWN: Final = ("implants", "together", "flow", "change", "quality", "uncertainty")
