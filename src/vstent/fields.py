@@ -60,6 +60,19 @@ def number(text: str) -> float:
     return _numbers(text, float, 1)[0]
 
 
+class Speed(float):
+    """A mean speed, m/s, given in place of a flow rate."""
+
+
+def flow_rate(text: str) -> float:
+    """Return a flow rate in mL/s read from text with its unit, mL/s where none is written; m/s is a `Speed`."""
+    value, _, unit = re.sub(r"(?<=[\d.])\s*(?=[a-zA-Z]+/)", " ", text.strip()).partition(" ")
+    kinds = {"": float, "ml/s": float, "ml/min": lambda mL_min: mL_min / 60, "m/s": Speed}
+    if unit.lower() not in kinds:
+        raise InputError(f"{text!r} has another unit: give mL/s, mL/min or m/s")
+    return kinds[unit.lower()](number(value))
+
+
 def whole(text: str) -> int:
     """Return a whole number read from text."""
     return _numbers(text, int, 1)[0]
@@ -144,11 +157,11 @@ class Option:
     counts: tuple[int, int] | None = None
     """Lowest and highest number of points; None: any."""
     choices: tuple[str, ...] = ()
-    """All values of a word; empty: any."""
+    """All values of a word; empty: any. A file may be given besides."""
     separators: str = ""
     """Characters between several values in a cell of a table; empty: the option is given once."""
     short: str = ""
-    """Short name of the option with its dash."""
+    """Another name of the option, with its dashes."""
     off: tuple[str, str] = ("", "")
     """Name and help of the option that states the opposite."""
     alone: str | None = None
@@ -156,7 +169,7 @@ class Option:
     load: Callable[[Any], Any] | None = None
     """Returns the setting that a value stands for, such as the content of a file; None: the value itself."""
     is_file: bool = False
-    """Whether the value is the path of a file, unless it is `alone`."""
+    """Whether the value is the path of a file, unless it is `alone` or one of `choices`."""
 
     @property
     def placeholder(self) -> str | None:
@@ -165,7 +178,7 @@ class Option:
 
     def value(self, text: str) -> Any:
         """Return a value read from the command line; InputError where the text is no value of this option."""
-        if self.choices and text not in self.choices:
+        if self.choices and not self.is_file and text not in self.choices:
             raise InputError(f"{text!r} is not one of {', '.join(self.choices)}")
         return self.check(self.read(text))
 
@@ -173,7 +186,7 @@ class Option:
         """Return a value, or several, read from a cell of a table in a folder, to which paths are relative."""
         if self.separators:
             return tuple(self.value(part.strip()) for part in re.split(f"[{self.separators}]", text) if part.strip())
-        return self.value(str(folder / text) if self.is_file and text != self.alone else text)
+        return self.value(str(folder / text) if self.is_file and text not in (self.alone, *self.choices) else text)
 
     def check(self, value: Any) -> Any:
         """Return a value; InputError where a number is outside the limits, or there are too many or too few points."""

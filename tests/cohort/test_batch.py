@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stated import NECK, STATED, needed
+from stated import NECK, OUTLETS, STATED, needed
 
 from vstent import phantoms
 from vstent.cli import main
@@ -282,6 +282,7 @@ def test_the_columns_are_the_options():
 def test_a_cell_reaches_its_setting(column, tmp_path, monkeypatch):
     monkeypatch.setattr("vstent.cohort.cases.check_engine", lambda flow, runs_here: None)  # there may be no GPU
     (tmp_path / "neck.csv").write_text(NECK)
+    (tmp_path / "outlets.csv").write_text(OUTLETS)
     text, expected = STATED[column]
     rows = [{"input": "a.stl", "case": "first", column: text}, {"input": "a.stl", "case": "last"}]
     write_rows(tmp_path / "list.csv", rows)

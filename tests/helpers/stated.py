@@ -9,6 +9,8 @@ from vstent.study.settings import AnatomySettings, InputSettings, Settings
 USUAL = ("silk", "enterprise")
 NECK = "1,2,3\n4,5,6\n7,8,9\n"
 """Content of the file ``neck.csv``."""
+OUTLETS = "R_p (Pa s/m3), C (m3/Pa), R_d\n6e8,1e-9,9e8\n"
+"""Content of the file ``outlets.csv``."""
 STATED = {
     "units": ("cm", Settings(InputSettings(units="cm"))),
     "frame": ("ras", Settings(InputSettings(frame="ras"))),
@@ -36,15 +38,17 @@ STATED = {
     "length": ("20", Settings(treatments=tuple(with_device(one, length_mm=20.0) for one in USUAL))),
     "center": ("-2", Settings(treatments=tuple(with_device(one, center_mm=-2.0) for one in USUAL))),
     "no-flow": ("yes", Settings(flow=None)),
-    "flow-rate": ("4.5", Settings(flow=FlowSettings(inflow_mL_s=4.5))),
+    "inlet-speed": ("0.3", Settings(flow=FlowSettings(inlet_speed_m_s=0.3))),
+    "flow-rate": ("270 mL/min", Settings(flow=FlowSettings(inflow_mL_s=4.5))),
     "density": ("1050", Settings(flow=FlowSettings(blood=Blood(1050.0)))),
     "viscosity": ("0.0035", Settings(flow=FlowSettings(blood=Blood(viscosity_Pa_s=0.0035)))),
     "shear-thinning": ("yes", Settings(flow=FlowSettings(blood=Blood(1060.0, 0.00345, CarreauYasuda())))),
-    "pulsatile": ("published", Settings(flow=FlowSettings(waveform=OLDER_ADULT_ICA))),
+    "pulsatile": ("ica_older_adults", Settings(flow=FlowSettings(waveform=OLDER_ADULT_ICA))),
     "steady": ("yes", Settings()),
     "outlets": ("murray", Settings(flow=FlowSettings(outlets="murray"))),
     "inlet-profile": ("plug", Settings(flow=FlowSettings(profile="plug"))),
     "outlet-shares": ("3, 2, 1", Settings(flow=FlowSettings(shares=(3.0, 2.0, 1.0)))),
+    "outlet-table": ("outlets.csv", Settings(flow=FlowSettings(elements=((600.0, 0.001, 900.0),)))),
     "outlet-exponent": ("2", Settings(flow=FlowSettings(outlet_exponent=2.0))),
     "mean-pressure": ("100", Settings(flow=FlowSettings(mean_pressure_mmHg=100.0))),
     "windkessel-time": ("0.5", Settings(flow=FlowSettings(compliance_time_s=0.5))),
@@ -69,5 +73,5 @@ STATED = {
 def needed(option: str) -> dict[str, object]:
     """What must be given for an option to have an effect, as values of options."""
     if option == "steady":
-        return {"pulsatile": "published"}
+        return {"pulsatile": "ica_older_adults"}
     return {"uncertainty": 8} if option.startswith(("vary", "uncertainty-")) else {}

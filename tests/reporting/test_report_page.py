@@ -156,7 +156,7 @@ def test_of_a_pulse_it_is_said_which_numbers_are_means(page):
         ),
         (
             FlowSettings(
-                4.0, "plug", Blood(thinning=CarreauYasuda()), None, "murray", numerics=Numerics(engine="openfoam")
+                4.0, None, "plug", Blood(thinning=CarreauYasuda()), None, "murray", numerics=Numerics(engine="openfoam")
             ),
             ("Blood is shear-thinning", "by their diameter cubed", "meshed wires over the neck"),
             ("Newtonian", "pressure at the outlets", "porous screen", "inflow is assumed"),

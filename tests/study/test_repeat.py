@@ -18,6 +18,7 @@ from vstent.cli import main
 from vstent.devices.treatment import Implant, Placing, Treatment
 from vstent.errors import ReadError
 from vstent.fields import sections_of
+from vstent.flow.measured import MeasuredProfile
 from vstent.flow.settings import Blood, CarreauYasuda, FlowSettings, Numerics
 from vstent.flow.waveform import OLDER_ADULT_ICA
 from vstent.io.writers import write_json, write_stl
@@ -145,12 +146,14 @@ ALL = Settings(
     ),
     FlowSettings(
         1 / 3,
-        "womersley",
+        0.3,
+        MeasuredProfile(((0.0, 1.0, 2.0), (3.0, 1 / 3, 4.0)), (((0.1, 0.2, 1 / 3), (0.4, 0.5, 0.6)),), 0.9),
         Blood(1050.0, 0.0035, CarreauYasuda(0.05, 2.0, 1.3, 0.3)),
         OLDER_ADULT_ICA,
         "windkessel",
         (0.5, 1 / 3),
         2.5,
+        ((1 / 3, 0.1, 2.0),),
         95.0,
         0.7,
         0.4,

@@ -9,6 +9,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model,
 from vstent.devices.catalogue import baskets
 from vstent.devices.treatment import Placing, Treatment
 from vstent.fields import POSITION, Option, check_all
+from vstent.flow.measured import MeasuredProfile
 from vstent.flow.settings import FlowSettings, Numerics
 from vstent.flow.waveform import OLDER_ADULT_ICA, Waveform
 from vstent.plan.ranges import Ranges
@@ -185,4 +186,5 @@ class Choices(OfVessel):
 
 def pulse_of(former: FlowSettings) -> Waveform:
     """Return the waveform that can be chosen: that of the study the case was opened from, or the published one."""
-    return former.waveform or OLDER_ADULT_ICA
+    measured = former.profile if isinstance(former.profile, MeasuredProfile) else None
+    return former.waveform or (measured and measured.waveform) or OLDER_ADULT_ICA

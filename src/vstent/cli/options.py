@@ -30,7 +30,8 @@ def add_option(group: "argparse._ActionsContainer", option: fields.Option, **mor
     about = f"{option.help}, {option.limits.unit}" if option.limits.unit else option.help
     about += f" (default: {option.usual})" if option.usual else ""
     about += "; repeat for several" if option.separators else ""
-    names = [*([option.short] if option.short else []), f"--{option.name}"]
+    names = [one for one in (option.short, f"--{option.name}") if one]
+    names.sort(key=lambda one: one.startswith("--") and one != f"--{option.name}")
     if option.off[0]:
         group = group.add_mutually_exclusive_group()
         add_flag(group, *option.off)
@@ -45,7 +46,7 @@ def add_option(group: "argparse._ActionsContainer", option: fields.Option, **mor
             raise argparse.ArgumentTypeError(str(error)) from None
 
     kind: dict[str, Any] = {"type": read, "help": about}
-    kind |= {"choices": option.choices} if option.choices else {"metavar": option.placeholder}
+    kind |= {"choices": option.choices} if option.choices and not option.is_file else {"metavar": option.placeholder}
     if option.separators:
         kind["action"] = "append"
     if option.alone:
@@ -76,9 +77,12 @@ def add_settings(parser: argparse.ArgumentParser, *sections: str, without: Conta
 
 def given(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the values of the options of the settings, by name; only those that are given."""
-    values = {name: getattr(arguments, name.replace("-", "_"), None) for name in OPTIONS}
+    names = (*OPTIONS, *(option.off[0] for option in OPTIONS.values() if option.off[0]))
+    values = {name: getattr(arguments, name.replace("-", "_"), None) for name in names}
     return {
-        name: tuple(value) if isinstance(value, list) else value for name, value in values.items() if value is not None
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in values.items()
+        if value is not None and value is not False
     }
 
 

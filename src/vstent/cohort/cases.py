@@ -116,7 +116,7 @@ def _case(file: Path, line: int, row: Mapping[str, Any], given: Mapping[str, Any
         for title, text in cells.items():
             try:
                 if title in OPPOSITES:
-                    values |= {OPPOSITES[title]: None} if flag(text) else {}
+                    values |= {title: True, OPPOSITES[title]: None} if flag(text) else {}
                 else:
                     values[title] = OPTIONS[title].cell(text, file.parent)
             except InputError as error:

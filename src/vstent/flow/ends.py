@@ -1,13 +1,18 @@
 """Boundary conditions at the openings of a vessel, and what the settings' word for the outlets means."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 import numpy as np
 
 from vstent.errors import InputError
-from vstent.flow.settings import FlowSettings, Profile
+from vstent.flow.forks import shares_by_forks
+from vstent.flow.measured import MeasuredProfile, Profile
+from vstent.flow.profile import developed_profile, plug_profile, pulsating_profiles
+from vstent.flow.registration import harmonics_of, registered
+from vstent.flow.settings import RESISTING, Blood, FlowSettings
+from vstent.flow.waveform import Waveform
 from vstent.geometry.vessel import Opening, Vessel, murray_shares
 from vstent.kernels.arrays import Complex, Floats
 from vstent.units import PA_PER_MMHG, counted
@@ -26,8 +31,37 @@ class Inflow:
     """Mean flow rate in."""
     source: str = ""
     """Where it comes from, for a user; empty: it was given."""
-    profile: Profile = "developed"
-    """Velocity profile."""
+    profile: Profile | MeasuredProfile = "developed"
+    """Velocity profile. A measured one over a cycle has the waveform of the case."""
+
+    @property
+    def is_pulsating(self) -> bool:
+        """Whether the profile changes its shape over a cycle."""
+        profile = self.profile
+        return profile == "womersley" if isinstance(profile, str) else profile.period_s is not None
+
+    def relative_velocity(self, section_mm: Floats, normal: Floats, points_mm: Floats) -> Floats:
+        """Return the velocity over its mean (n, 3) in a section (k, 3) at points (n, 3), averaged over the cycle."""
+        section = section_mm, normal, points_mm
+        if isinstance(self.profile, MeasuredProfile):
+            return registered(self.profile.section, *section).mean(axis=0)
+        profile = plug_profile if self.profile == "plug" else developed_profile
+        return np.asarray(-profile(*section)[:, None] * normal)
+
+    def pulsating_velocity(
+        self, pulse: Waveform, blood: Blood, time_s: Floats, section_mm: Floats, normal: Floats, points_mm: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return the velocity over its mean at points (n, 3): its average (n, 3), and (t, n, 3) at times (t,)."""
+        section = section_mm, normal, points_mm
+        rate_per_s, amplitude = pulse.harmonics
+        if isinstance(self.profile, MeasuredProfile):
+            steady, waves = harmonics_of(registered(self.profile.section, *section), len(rate_per_s))
+        else:
+            steady = self.relative_velocity(*section)
+            speed = amplitude[:, None] * pulsating_profiles(*section, rate_per_s, blood.kinematic_viscosity_m2_s)
+            waves = -speed[..., None] * normal
+        turned = np.exp(1j * np.outer(time_s, rate_per_s))
+        return steady, steady + np.tensordot(turned, waves, 1).real
 
 
 @dataclass(frozen=True)
@@ -93,39 +127,73 @@ def ends_of(vessel: Vessel, settings: FlowSettings) -> tuple[End, ...]:
     outlets have fixed shares, all but the widest get a flow rate, and the widest has zero pressure and takes the rest.
     """
     inlets, outlets = vessel.inlets, vessel.outlets
-    inflow_mL_s = MEAN_INLET_SPEED_M_S * np.array([inlet.area_mm2 for inlet in inlets])
-    if settings.inflow_mL_s is not None:
-        inflow_mL_s = settings.inflow_mL_s * murray_shares(inlets)
-    source = ASSUMED if settings.inflow_mL_s is None else ""
+    inflow_mL_s, source = _inflow(inlets, settings)
     entering = [Inflow(mean_mL_s, source, settings.profile) for mean_mL_s in inflow_mL_s.tolist()]
-    if settings.shares is not None and settings.outlets in ("zero_pressure", "murray"):
-        raise InputError(
-            f"shares of the outlets have no effect with --outlets {settings.outlets}: choose split, resistance or "
-            "windkessel"
-        )
+    for word, given, usable in (
+        ("shares", settings.shares, ("split", *RESISTING)),
+        ("a table", settings.elements, RESISTING),
+    ):
+        if given is not None and settings.outlets not in usable:
+            choice = f"{', '.join(usable[:-1])} or {usable[-1]}"
+            raise InputError(f"{word} of the outlets have no effect with --outlets {settings.outlets}: choose {choice}")
     if settings.outlets == "zero_pressure":
         return (*entering, *(Pressure() for _ in outlets))
-    shares = murray_shares(outlets) if settings.outlets == "murray" else _shares(outlets, settings)
+    shares = murray_shares(outlets) if settings.outlets == "murray" else _shares(vessel, settings)
     outflow_mL_s = (inflow_mL_s.sum() * shares).tolist()
     if settings.outlets in ("murray", "split"):
         return (*entering, Pressure(), *map(FlowRate, outflow_mL_s[1:]))
+    if settings.elements is not None:
+        return (*entering, *_tabled(outlets, settings, float(inflow_mL_s.sum())))
     pressure_Pa = PA_PER_MMHG * settings.mean_pressure_mmHg
     compliant = settings.compliance_time_s, settings.proximal_fraction
     stored = compliant if settings.outlets == "windkessel" else ()
     return (*entering, *(Resistance(mean_mL_s, pressure_Pa, *stored) for mean_mL_s in outflow_mL_s))
 
 
-def _shares(outlets: Sequence[Opening], settings: FlowSettings) -> Floats:
-    """Return the share (k,) of every outlet: as given, or by diameter."""
-    parts = np.array([outlet.diameter_mm for outlet in outlets]) ** settings.outlet_exponent
-    if settings.shares is not None:
-        if len(settings.shares) != len(outlets):
-            raise InputError(
-                f"{counted(len(settings.shares), 'share')} of the flow for {counted(len(outlets), 'outlet')}: give one "
-                "for each outlet, the widest first (--outlet-shares)"
-            )
-        parts = np.array(settings.shares)
-    return np.asarray(parts / parts.sum())
+def _inflow(inlets: Sequence[Opening], settings: FlowSettings) -> tuple[Floats, str]:
+    """Return the flow rate (i,) through every inlet, and where it comes from."""
+    profile, speed_m_s = settings.profile, settings.inlet_speed_m_s
+    is_given = settings.inflow_mL_s is not None or speed_m_s is not None
+    by_speed_mL_s = (speed_m_s or MEAN_INLET_SPEED_M_S) * np.array([inlet.area_mm2 for inlet in inlets])
+    given_mL_s = by_speed_mL_s if settings.inflow_mL_s is None else settings.inflow_mL_s * murray_shares(inlets)
+    if not isinstance(profile, MeasuredProfile):
+        return given_mL_s, "" if is_given else ASSUMED
+    if len(inlets) > 1:
+        raise InputError("a measured profile belongs to one inlet, and this vessel has several: give one of the words")
+    if settings.waveform not in (None, profile.waveform) and profile.period_s is not None:
+        raise InputError(
+            "the inlet profile has times, and another waveform is given: leave out --pulsatile or the times"
+        )
+    measured_mL_s = np.array([profile.section.flow_mL_s.mean()])
+    return given_mL_s if is_given else measured_mL_s, profile.section.described(inlets[0].normal)
+
+
+def _shares(vessel: Vessel, settings: FlowSettings) -> Floats:
+    """Return the share (k,) of every outlet: as given, or by the diameters at every fork."""
+    if settings.shares is None:
+        return shares_by_forks(vessel, settings.outlet_exponent)
+    _check_count(vessel.outlets, len(settings.shares), "share", "--outlet-shares")
+    return np.array(settings.shares) / sum(settings.shares)
+
+
+def _tabled(outlets: Sequence[Opening], settings: FlowSettings, inflow_mL_s: float) -> Iterator[Resistance]:
+    """Yield the resistance or Windkessel of every outlet in a table."""
+    elements = settings.elements or ()
+    _check_count(outlets, len(elements), "row", "--outlet-table")
+    pressure_Pa = inflow_mL_s / sum(1 / (proximal + distal) for proximal, _, distal in elements)
+    for proximal, compliance, distal in elements:
+        whole = proximal + distal
+        stored = (whole * compliance, proximal / whole) if settings.outlets == "windkessel" else (0.0, 1.0)
+        yield Resistance(pressure_Pa / whole, pressure_Pa, *stored, whole)
+
+
+def _check_count(outlets: Sequence[Opening], count: int, what: str, option: str) -> None:
+    """Raise InputError where there are not as many values as outlets."""
+    if count != len(outlets):
+        raise InputError(
+            f"{counted(count, what)} for {counted(len(outlets), 'outlet')}: give one for each outlet, the widest first "
+            f"({option})"
+        )
 
 
 def outflows(

@@ -18,7 +18,7 @@ POINTS: Final = 64
 def plug_profile(section_mm: Floats, normal: Floats, points_mm: Floats) -> Floats:
     """Return the axial speed over its mean (n,) of a uniform flow in a flat section (k, 3), at points (n, 3)."""
     across = _across(normal)
-    depth = _depth((section_mm - section_mm[0]) @ across, (points_mm - section_mm[0]) @ across)
+    depth = distance_inside((section_mm - section_mm[0]) @ across, (points_mm - section_mm[0]) @ across)
     return np.where(depth > 0, 1.0, 0.0)
 
 
@@ -68,11 +68,9 @@ def _developed(section_mm: Floats, normal: Floats, points_mm: Floats) -> tuple[F
     center = section_mm.mean(axis=0)
     across = _across(normal)
     polygon = (section_mm - center) @ across
-    spacing = float(np.ptp(polygon, axis=0).max()) / POINTS
-    low = polygon.min(axis=0) - 2.01 * spacing
-    shape = np.ceil(np.ptp(polygon, axis=0) / spacing).astype(int) + 5
-    grid = low + spacing * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
-    depth = _depth(polygon, grid)
+    grid, spacing = grid_over(polygon)
+    low = grid[0, 0]
+    depth = distance_inside(polygon, grid)
     speed = _poisson(depth / spacing)
     inside = speed[depth > 0] / speed[depth > 0].mean()
     speed = _beyond(speed / speed[depth > 0].mean(), depth)
@@ -80,7 +78,15 @@ def _developed(section_mm: Floats, normal: Floats, points_mm: Floats) -> tuple[F
     return np.maximum(ndimage.map_coordinates(speed, where.T, order=1, mode="constant"), 0.0), inside
 
 
-def _depth(polygon: Floats, points: Floats) -> Floats:
+def grid_over(polygon: Floats) -> tuple[Floats, float]:
+    """Return grid points (i, j, 2) over a polygon (k, 2) and their spacing, with a margin of two points."""
+    spacing = float(np.ptp(polygon, axis=0).max()) / POINTS
+    low = polygon.min(axis=0) - 2.01 * spacing
+    shape = np.ceil(np.ptp(polygon, axis=0) / spacing).astype(int) + 5
+    return low + spacing * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1), spacing
+
+
+def distance_inside(polygon: Floats, points: Floats) -> Floats:
     """Return the distance (...) of points (..., 2) from a polygon (k, 2), negative outside.
 
     Points inside have an odd number of edges to their right.

@@ -4,10 +4,14 @@ This module imports no numpy, so that command-line options and settings of a stu
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
-from vstent.fields import Limits, flag, numbers, setting, whole
-from vstent.flow.waveform import PUBLISHED, Waveform, read_waveform
+from vstent.errors import InputError
+from vstent.fields import Limits, flag, flow_rate, numbers, setting, whole
+from vstent.flow.measured import MeasuredProfile, Profile, read_profile
+from vstent.flow.waveform import PUBLISHED, SOURCES, Waveform, read_waveform
+from vstent.units import PA_PER_MMHG
 
 if TYPE_CHECKING:
     from vstent.kernels.arrays import Floats
@@ -16,14 +20,34 @@ Outlets = Literal["zero_pressure", "murray", "split", "resistance", "windkessel"
 """Condition at the outlets."""
 RESISTING: Final = ("resistance", "windkessel")
 """Conditions with which the flow out follows the pressure."""
-Profile = Literal["developed", "plug", "womersley"]
-"""Velocity profile at the inlets."""
+Elements = tuple[float, float, float]
+"""Windkessel of an outlet: proximal resistance, Pa s/mL, compliance, mL/Pa, and distal resistance, Pa s/mL."""
+PER_UNIT: Final = {"pa s/m3": 1e-6, "mmhg s/ml": PA_PER_MMHG, "dyn s/cm5": 0.1}
+"""Resistances in Pa s/mL of each unit that a table of outlets may have."""
 LATTICE: Final = "lattice_boltzmann"
 """Name of the embedded lattice-Boltzmann engine."""
 OPENFOAM: Final = "openfoam"
 """Name of the engine that runs OpenFOAM, a separate program."""
 HIGH_SHEAR_VISCOSITY_PA_S: Final = 0.00345
 """Viscosity at high shear rate, Pa s, that belongs to the default values of `CarreauYasuda` (Cho and Kensey 1991)."""
+
+
+def read_elements(source: str) -> tuple[Elements, ...]:
+    """Return the Windkessel of every row of a CSV file; a resistance alone is one without a compliance."""
+    from vstent.io.tables import read_columns
+
+    rows = read_columns(Path(source), 1, 3)
+    titles = " ".join(Path(source).read_text("utf-8-sig", "replace").lower().replace("*", " ").split())
+    units = [factor for unit, factor in PER_UNIT.items() if unit in titles]
+    if len(units) != 1:
+        raise InputError(
+            f"the titles of {source} state no unit of the resistances: write 'R_p (mmHg s/mL), C, R_d' above the "
+            "numbers, or the same with Pa s/m3 or dyn s/cm5"
+        )
+    if (rows < 0).any() or (rows[:, [0, -1]] <= 0).any():
+        raise InputError(f"{source} has a resistance that is not positive, or a negative compliance: correct it")
+    wide = rows if rows.shape[1] == 3 else rows @ [[1.0, 0.0, 0.0]]
+    return tuple((p * units[0], c / units[0], d * units[0]) for p, c, d in wide.tolist())
 
 
 @dataclass(frozen=True)
@@ -147,30 +171,47 @@ class FlowSettings:
     inflow_mL_s: float | None = setting(
         None,
         "flow-rate",
-        "mean inflow of all inlets",
-        limits=Limits("mL/s", above=0.0, high=50.0, remark="240 mL/min are 4 mL/s"),
+        "mean inflow of all inlets, such as '245 mL/min', '4.1 mL/s' or '0.27 m/s'; without a unit",
+        flow_rate,
+        Limits("mL/s", above=0.0, high=50.0, remark="240 mL/min are 4 mL/s"),
         usual="assumed: 0.27 m/s times their area, as in VaMPy",
+        short="--inflow",
     )
-    """Mean flow rate through all inlets together; None: 0.27 m/s times the area of each inlet."""
-    profile: Profile = setting(
+    """Mean flow rate through all inlets together; None: that of `inlet_speed_m_s`."""
+    inlet_speed_m_s: float | None = setting(
+        None,
+        "inlet-speed",
+        "mean speed in every inlet, in place of --flow-rate",
+        limits=Limits("m/s", above=0.0, high=2.0, remark="27 cm/s are 0.27 m/s"),
+        usual="0.27",
+    )
+    """Mean speed in every inlet, where no flow rate is given; None: the flow that a measured profile has, or an assumed
+    speed of 0.27 m/s."""
+    profile: Profile | MeasuredProfile = setting(
         "developed",
         "inlet-profile",
-        "velocity profile at the inlets: fully developed, plug (uniform), or that of a pulse in a long straight artery "
-        "(womersley)",
+        "velocity profile at the inlets: fully developed (developed), uniform (plug), that of a pulse in a long "
+        "straight artery (womersley), or a measured one: a CSV file with columns x, y, z (mm), u, v, w (m/s)",
         str,
         choices=get_args(Profile),
+        metavar="WORD|CSV",
+        load=read_profile,
+        is_file=True,
     )
-    """Velocity profile at every inlet; that of Womersley is the developed one in steady flow."""
+    """Velocity profile at every inlet; that of Womersley is the developed one in steady flow. A measured one needs a
+    single inlet."""
     blood: Blood = Blood()
     """The fluid."""
     waveform: Waveform | None = setting(
         None,
         "pulsatile",
-        "pulsatile inflow: a CSV file with columns time (s) and flow (any unit); without a file the published waveform "
-        "of the internal carotid artery (Hoi et al. 2010)",
+        "pulsatile inflow: a CSV file with columns time (s) and flow (any unit), or the name of a published waveform: "
+        + "; ".join(f"{name} ({source})" for name, source in SOURCES.items()),
         str,
-        metavar="CSV",
+        metavar="NAME|CSV",
+        choices=tuple(SOURCES),
         alone=PUBLISHED,
+        short="--waveform",
         load=read_waveform,
         is_file=True,
         off=("steady", "constant mean inflow (the default)"),
@@ -179,7 +220,8 @@ class FlowSettings:
     outlets: Outlets = setting(
         "zero_pressure",
         "outlets",
-        "zero pressure; fixed shares of the flow, by Murray's law (diameter cubed) or as given (split); or a "
+        "zero pressure; fixed shares of the flow, by Murray's law (diameter cubed of all outlets) or fork by fork or "
+        "as given (split); or a "
         "resistance or Windkessel at each outlet, so that a covered branch loses flow",
         str,
         choices=get_args(Outlets),
@@ -199,10 +241,22 @@ class FlowSettings:
     outlet_exponent: float = setting(
         3.0,
         "outlet-exponent",
-        "power of the diameter to which the share of an outlet is proportional",
+        "power of the diameter by which every fork divides the flow",
         limits=Limits(low=1.0, high=4.0),
     )
-    """Power of the diameter to which the share of an outlet is proportional, where no shares are given."""
+    """Power of the diameter by which every fork divides the flow, where no shares are given."""
+    elements: tuple[Elements, ...] | None = setting(
+        None,
+        "outlet-table",
+        "resistances and compliance of all outlets in their order: a CSV file with columns R_p, C, R_d, or R alone, "
+        "and the unit of the resistances in its title (mmHg s/mL, Pa s/m3 or dyn s/cm5)",
+        str,
+        metavar="CSV",
+        load=read_elements,
+        is_file=True,
+        usual="from shares and mean pressure",
+    )
+    """Windkessel of every outlet, with ``resistance`` and ``windkessel``; None: from shares and mean pressure."""
     mean_pressure_mmHg: float = setting(
         93.0,
         "mean-pressure",

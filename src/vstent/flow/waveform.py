@@ -12,8 +12,8 @@ from vstent.errors import InputError
 if TYPE_CHECKING:
     from vstent.kernels.arrays import Complex, Floats
 
-PUBLISHED: Final = "published"
-"""Word for the published waveform, in place of the file of a measured one."""
+PUBLISHED: Final = "ica_older_adults"
+"""Name of the waveform that is taken where none is named."""
 LONGEST_CYCLE_S: Final = 3.0
 """Longest cardiac cycle accepted, in s: 20 beats a minute."""
 SHORTEST_CYCLE_S: Final = 0.2
@@ -75,6 +75,10 @@ OLDER_ADULT_ICA = Waveform(
     ),
 )
 """Waveform of the internal carotid artery of older adults, 20 harmonics (Hoi et al. 2010, Physiol. Meas. 31, 291)."""
+WAVEFORMS: Final = {PUBLISHED: OLDER_ADULT_ICA}
+"""Published waveforms by name."""
+SOURCES: Final = {PUBLISHED: "internal carotid artery, Hoi et al. 2010"}
+"""Artery and reference of every published waveform."""
 HARMONICS = 20
 """Number of harmonics kept of a measured waveform."""
 RESAMPLED = 512
@@ -82,11 +86,13 @@ RESAMPLED = 512
 
 
 def read_waveform(source: str) -> Waveform:
-    """Return the published waveform, or the one in a CSV file."""
+    """Return the published waveform of a name, or the one in a CSV file, whose flow may be negative at times."""
     from vstent.io.tables import read_columns
 
-    if source == PUBLISHED:
-        return OLDER_ADULT_ICA
+    if source in WAVEFORMS:
+        return WAVEFORMS[source]
+    if not Path(source).exists():
+        raise InputError(f"the waveform {source!r} is not {' or '.join(WAVEFORMS)}, and no such file exists")
     time_s, flow = read_columns(Path(source), 2).T
     waveform = waveform_of(time_s, flow)
     if not SHORTEST_CYCLE_S <= waveform.period_s <= LONGEST_CYCLE_S:

@@ -16,19 +16,20 @@ from vstent.io.writers import SIGNIFICANT_DIGITS, write_text
 from vstent.kernels.arrays import Floats
 
 
-def read_columns(path: Path, count: int) -> Floats:
-    """Return the numbers (n, `count`) of a CSV file with commas, semicolons or tabs.
+def read_columns(path: Path, *counts: int) -> Floats:
+    """Return the numbers (n, c) of a CSV file with commas, semicolons or tabs; c is one of `counts`.
 
     Lines above the first number are titles. ReadError is raised where the file is missing, or a line does not hold
-    `count` finite numbers.
+    c finite numbers.
     """
+    count = " or ".join(map(str, counts))
     rows: list[list[float]] = []
     for number, line in enumerate(existing(path).read_text("utf-8-sig", "replace").splitlines(), start=1):
         words = [word for word in line.replace(";", ",").replace("\t", ",").split(",") if word.strip()]
         values = [value for word in words if math.isfinite(value := _number(word))]
         if not words or (not rows and not values):
             continue
-        if not len(values) == len(words) == count:
+        if len(values) != len(words) or len(values) not in (counts if not rows else (len(rows[0]),)):
             raise ReadError(
                 f"line {number} of {path} is {line[:60]!r}: give {count} finite numbers, with decimal points, "
                 "separated by commas"

@@ -208,7 +208,8 @@ def _sample(
     found: dict[str, float] = {name: float(measures[name]) for name in RESULTS if name in measures}
     if flow is None or not other.aneurysms:
         return found
-    flow = replace(flow, inflow_mL_s=flow_case(anatomy, (), flow).inflow_mL_s * (1 + inflow_fraction))
+    inflow_mL_s = flow_case(anatomy, (), flow).inflow_mL_s * (1 + inflow_fraction)
+    flow = replace(flow, inflow_mL_s=inflow_mL_s, inlet_speed_m_s=None)
     shapes = sac_surfaces(other)
     bare = simulate_case(flow_case(other, (), flow))
     after = simulate_case(flow_case(other, (deployed.stent,), flow), start=bare)

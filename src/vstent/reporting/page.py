@@ -41,8 +41,8 @@ AT_OUTLETS: Final = {
     "zero_pressure": "the pressure at the outlets is assumed, not measured in the patient",
     "murray": "the flow is split among the outlets by their diameter cubed, not measured in the patient",
     "split": "the shares of the outlets in the flow are assumed, unless they were measured in the patient",
-    "resistance": "the resistance downstream of every outlet is assumed, from the mean arterial pressure and its share",
-    "windkessel": "the Windkessel downstream of every outlet is assumed, from the mean arterial pressure and its share",
+    "resistance": "the resistance downstream of every outlet is assumed, unless a table states it",
+    "windkessel": "the Windkessel downstream of every outlet is assumed, unless a table states it",
 }
 """Limit that a report states, by the outlet setting of the flow."""
 SHOWN: Final = ("implants", "together", "flow", "change", "quality", "uncertainty")
@@ -192,7 +192,7 @@ def limits_of(case: "CaseResult") -> tuple[str, ...]:
     limits = [OF_CONTOUR, f"{blood}, and the wall is rigid; {AT_OUTLETS[flow['outlets']]}."]
     if flow["numerics"]["engine"] in OF_DEVICE:
         limits.append(OF_DEVICE[flow["numerics"]["engine"]])
-    if flow["inflow_mL_s"] is None:
+    if flow["inflow_mL_s"] is flow["inlet_speed_m_s"] is None and isinstance(flow["profile"], str):
         limits.append(f"The inflow is {ASSUMED}, times the area of every inlet. It was not measured in the patient.")
     if len(case.anatomy.vessel.inlets) > 1:
         limits.append(AT_INLETS)

@@ -47,6 +47,7 @@ def qualities(metrics: Mapping[str, Any], titles: Mapping[str, str]) -> list[Qua
         if name in graded:
             one, which = graded[name], f"Grid and convergence {f'with {title}' if title else 'without a device'}"
             spacing, inflow = (format_value(key, one[key]) for key in ("grid_spacing_mm", "inflow_mL_s"))
+            inflow += f" ({60 * one['inflow_mL_s']:.0f} mL/min)"
             source = f", {one['inflow_source']}" if "inflow_source" in one else ""
             computation = (
                 f"grid spacing {spacing}, {one['cells_count']:,} cells, {one['steps_count']:,} time steps, inflow "

@@ -6,7 +6,7 @@ the command line appears at once.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from dataclasses import fields as fields_of
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
@@ -14,7 +14,8 @@ from typing import Any, Final, Literal, get_args
 from vstent import fields
 from vstent.devices.treatment import Treatment, read_treatment, with_device
 from vstent.errors import InputError
-from vstent.fields import LENGTH, POSITION, Limits, Option, box, flag, point, setting, shape, spacing, whole
+from vstent.fields import LENGTH, POSITION, Limits, Option, Speed, box, flag, point, setting, shape, spacing, whole
+from vstent.flow.measured import MeasuredProfile
 from vstent.flow.settings import HIGH_SHEAR_VISCOSITY_PA_S, FlowSettings
 from vstent.plan.ranges import Ranges
 
@@ -159,16 +160,24 @@ def settings_of(given: Mapping[str, Any]) -> Settings:
         A file cannot be read, or an option is given without the one that it belongs to.
     """
     given = {name: value for name, value in given.items() if value is not None}
+    if {"flow-rate", "inlet-speed"} <= given.keys():
+        raise InputError("--flow-rate and --inlet-speed both state the inflow: leave out one of them")
+    if isinstance(given.get("flow-rate"), Speed):
+        given["inlet-speed"] = OPTIONS["inlet-speed"].checked(float(given.pop("flow-rate")))
     if given.get("shear-thinning"):
         given = {"viscosity": HIGH_SHEAR_VISCOSITY_PA_S} | given
     varied = [name for name in in_section("uncertainty") if name in given]
     if varied and "uncertainty" not in given:
         raise InputError(f"--{varied[0]} needs --uncertainty N: give that too")
+    flow = None if given.get("no-flow") else _section(FlowSettings, given)
+    measured = None if flow is None else flow.profile
+    if flow is not None and isinstance(measured, MeasuredProfile) and not {"pulsatile", "steady"} & given.keys():
+        flow = replace(flow, waveform=measured.waveform)
     return Settings(
         _section(InputSettings, given),
         _section(AnatomySettings, given),
         _treatments(given),
-        None if given.get("no-flow") else _section(FlowSettings, given),
+        flow,
         _section(Ranges, given) if varied else None,
     )
 

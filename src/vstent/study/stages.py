@@ -30,6 +30,7 @@ from vstent.devices.treatment import BARE, Implant
 from vstent.errors import DeviceError, FlowError, InputError, LandingError, ReadError, VesselError, VstentError
 from vstent.flow.background import BackgroundWork
 from vstent.flow.case import FlowField
+from vstent.flow.ends import ASSUMED
 from vstent.flow.engines import Progress as FlowProgress
 from vstent.flow.grade import computation_of, grade
 from vstent.flow.indices import balance, indices, ratios
@@ -237,9 +238,11 @@ def size_of(implant: Implant, anatomy: Anatomy) -> Size:
 
 def check_inflow(anatomy: Anatomy, flow: FlowSettings | None) -> None:
     """Raise InputError where no artery has the mean inflow: its unit or an inlet is wrong."""
-    if flow is None or (flow.inflow_mL_s is None and len(anatomy.vessel.inlets) == 1):
+    if flow is None:
         return
     case = vessel_case(anatomy.vessel, flow)
+    if case.inflow_source == ASSUMED and len(anatomy.vessel.inlets) == 1:
+        return
     outlets_mm2 = sum(outlet.area_mm2 for outlet in anatomy.vessel.outlets)
     if len(anatomy.vessel.inlets) > 1 and case.inflow_mL_s > FASTEST_M_S * outlets_mm2:
         raise InputError(

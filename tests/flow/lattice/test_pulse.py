@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from womersley import MEAN_MEAN_M_S, OMEGA, PULSE, RADIUS_M, womersley_m_s, womersley_wss_Pa
+from womersley import MEAN_MEAN_M_S, OMEGA, PULSE, RADIUS_M, SWING, womersley_m_s, womersley_wss_Pa
 
 from vstent import phantoms
 from vstent.anatomy.trace import trace
@@ -185,6 +185,38 @@ def test_wall_shear_stress_has_womersleys_amplitude_and_phase(
     assert stress.mean() == pytest.approx(mean_Pa, rel=0.02)
     assert abs(found) == pytest.approx(abs(amplitude_Pa), rel=0.02)
     assert abs(lag) < degrees
+
+
+@pytest.mark.parametrize(
+    ("cell_size_mm", "lattice_speed"), [(0.25, 0.1), pytest.param(0.2, 0.05, marks=pytest.mark.validation)]
+)
+def test_averaged_stress_and_its_oscillation_of_a_flow_through_zero_are_in_closed_form(
+    cell_size_mm: float, lattice_speed: float
+) -> None:
+    """Q0 + Q1 sin wt: TAWSS is the mean of |t0 + t1 sin x|, OSI (1 - |t0| / TAWSS) / 2."""
+    ratio = 3.0
+    pulse = Waveform(PULSE.period_s, (0.0,), (ratio,))
+    vessel = trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=14.0, radius_mm=2.0))))
+    settings = FlowSettings(
+        inflow_mL_s=MEAN_MEAN_M_S * np.pi * RADIUS_M**2 * 1e6,
+        profile="womersley",
+        waveform=pulse,
+        numerics=Numerics(cell_size_mm=cell_size_mm, lattice_speed=lattice_speed),
+    )
+    field = simulate_case(vessel_case(vessel, settings))
+    assert field.is_converged
+    mean_Pa, amplitude_Pa = womersley_wss_Pa()
+    swing = ratio / SWING * abs(amplitude_Pa) / mean_Pa
+    assert swing > 1.5  # the stress changes its direction
+    averaged_Pa = mean_Pa * (np.arcsin(1 / swing) + np.sqrt(swing**2 - 1)) * 2 / np.pi
+    oscillating = 0.5 * (1 - mean_Pa / averaged_Pa)
+    z = field.wall.vertices_mm[:, 2]
+    is_middle = (z > 5) & (z < 9)
+    found_Pa, found = field.shear_Pa[is_middle].mean(), field.oscillatory_shear_index[is_middle].mean()
+    off, oscillates = found_Pa / averaged_Pa - 1, found / oscillating - 1
+    print(f"Q0 + Q1 sin wt, {cell_size_mm} mm: TAWSS {off:+.2%}, OSI {oscillates:+.2%}")  # noqa: T201
+    assert found_Pa == pytest.approx(averaged_Pa, rel=0.02)
+    assert found == pytest.approx(oscillating, rel=0.02)
 
 
 def test_time_averaged_stress_and_its_oscillation_are_those_of_the_phases() -> None:

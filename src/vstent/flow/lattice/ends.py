@@ -16,7 +16,6 @@ from vstent.flow.ends import FlowRate, Inflow, Pressure, Resistance
 from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.scales import Scales
-from vstent.flow.profile import developed_profile, plug_profile, pulsating_profiles
 from vstent.kernels import directions
 from vstent.kernels.arrays import Floats, Ints
 
@@ -77,9 +76,9 @@ class Ends:
         return np.asarray(self.case.pulse.period_s * (finer + np.arange(count)) / count, dtype=np.float64)
 
     def _is_pulsating(self, patch: int) -> bool:
-        """Return whether the velocity profile at an end changes its shape over a cycle by Womersley's solution."""
+        """Return whether the velocity profile at an end changes its shape over a cycle."""
         end = self.case.ends[patch - 1] if patch <= len(self.case.ends) else None
-        return isinstance(end, Inflow) and end.profile == "womersley" and self.case.waveform is not None
+        return isinstance(end, Inflow) and end.is_pulsating and self.case.waveform is not None
 
     def _at(self, now: CloseUp | None, patches: Ints, links: Sequence[Ints]) -> tuple[Floats, Floats]:
         """Return rows for `d3q19.drive` and profile coefficients (l, 2) of all links at one moment."""
@@ -132,24 +131,21 @@ class Ends:
 
     def _profile(self, k: int, links: Ints, area: float, end: Inflow) -> Floats:
         """Return the profile coefficients (l, 2) of the links of inlet `k` for a profile of constant shape."""
-        normal = self.case.vessel.openings[k].normal
-        profile = plug_profile if end.profile == "plug" else developed_profile
-        speed = profile(self.domain.sections[k], normal, self._places_mm(links))
-        return self._sent(links, normal, area, *(-speed.reshape(3, -1, 1) * normal))
+        section = self.domain.sections[k], self.case.vessel.openings[k].normal, self._places_mm(links)
+        return self._sent(links, section[1], area, *end.relative_velocity(*section).reshape(3, -1, 3))
 
     def _pulsating(self, k: int, links: Ints, time_s: Floats) -> Floats:
         """Return the profile coefficients (m, l, 2) of the links of inlet `k` at times (m,), relative to mean flow."""
         case, opening, direction = self.case, self.case.vessel.openings[k], self.domain.link_direction[links]
-        rate_per_s, amplitude = case.pulse.harmonics
         section = self.domain.sections[k], opening.normal, self._places_mm(links)
-        steady = developed_profile(*section)
-        waves = pulsating_profiles(*section, rate_per_s, case.blood.kinematic_viscosity_m2_s)
-        speed = steady + ((amplitude * np.exp(1j * np.outer(time_s, rate_per_s))) @ waves).real
+        end = case.ends[k]
+        assert isinstance(end, Inflow)
+        steady, velocity = end.pulsating_velocity(case.pulse, case.blood, time_s, *section)
         area = opening.area_mm2 / self.domain.cell_size_mm**2
-        rim = _rim(direction, opening.normal, -steady.reshape(3, -1, 1)[1] * opening.normal)
+        rim = _rim(direction, opening.normal, steady.reshape(3, -1, 3)[1])
         result = np.zeros((len(time_s), len(links), 2))
-        for row, (flow, now) in enumerate(zip(area * case.pulse.factor(time_s), speed, strict=True)):
-            inner, at, outer = -now.reshape(3, -1, 1) * opening.normal
+        for row, (flow, now) in enumerate(zip(area * case.pulse.factor(time_s), velocity, strict=True)):
+            inner, at, outer = now.reshape(3, -1, 3)
             result[row] = self._sent(links, opening.normal, flow, inner, at, outer, rim)
         return result
 
