@@ -21,6 +21,7 @@ from vstent.flow.domain import MIN_CELLS, CoarseGridError, default_cell_size_mm
 from vstent.flow.engines import AbstractEngine, DivergenceError, Progress, Saved, run
 from vstent.flow.lattice.close_up import SHARE_AROUND, WIDTH, require_sac
 from vstent.flow.lattice.gpu import require_gpu
+from vstent.flow.measured import MeasuredProfile
 from vstent.flow.problem import flow_case
 from vstent.flow.settings import LATTICE, OPENFOAM, RESISTING, FlowSettings, Numerics
 from vstent.geometry.vessel import Anatomy
@@ -179,8 +180,8 @@ def check_engine(flow: FlowSettings | None, *, runs_here: bool = True) -> None:
     if flow is not None:
         engine = engine_class(flow.numerics, is_pulsatile=flow.waveform is not None)
         wanted = [f"--outlets {flow.outlets}"] if flow.outlets in RESISTING else []
-        if flow.profile == "womersley" and flow.waveform is not None:
-            wanted.append(f"--inlet-profile {flow.profile}")
+        if isinstance(flow.profile, MeasuredProfile) or (flow.profile == "womersley" and flow.waveform is not None):
+            wanted.append(f"--inlet-profile {flow.profile if isinstance(flow.profile, str) else 'FILE'}")
         if wanted and not engine.has_all_ends:
             raise InputError(
                 f"the engine {flow.numerics.engine} does not support {' and '.join(wanted)}: give fixed shares "

@@ -21,6 +21,7 @@ from vstent.flow.openfoam.case import foam_case, strut_solids
 from vstent.flow.openfoam.control import fluid
 from vstent.flow.openfoam.cost import tell_cost
 from vstent.flow.openfoam.dictionary import foam_file
+from vstent.flow.openfoam.engine import OpenFoam
 from vstent.flow.openfoam.patches import named_patches
 from vstent.flow.openfoam.setup import FoamSetup
 from vstent.flow.problem import flow_case, vessel_case
@@ -198,18 +199,52 @@ def test_a_plug_is_uniform_in_both_dialects() -> None:
     assert "profile" not in condition
 
 
-def test_conditions_that_openfoam_lacks_are_refused_before_it_meshes() -> None:
+def test_conditions_that_a_fork_of_openfoam_lacks_are_refused_before_it_meshes() -> None:
     assert (
         foam_case(with_profile("womersley"), SETUP).files == foam_case(case(), SETUP).files
     )  # the same in steady flow
-    with pytest.raises(InputError, match="cannot have Womersley profiles at its inlets: give"):
-        foam_case(with_profile("womersley", is_pulse=True), SETUP)
+    org = replace(SETUP, flavour="org")
+    with pytest.raises(InputError, match="cannot have measured or Womersley profiles at its inlets: give"):
+        foam_case(with_profile("womersley", is_pulse=True), org)
     with pytest.raises(InputError, match="cannot have resistances or Windkessels at its outlets: give"):
-        foam_case(case("windkessel"), SETUP)
-    for settings in (FlowSettings(outlets="resistance"), FlowSettings(profile="womersley", waveform=OLDER_ADULT_ICA)):
-        check_engine(settings)
-        with pytest.raises(InputError, match="the engine openfoam does not support --"):
-            check_engine(replace(settings, numerics=Numerics(engine="openfoam")))
+        foam_case(case("windkessel"), org)
+
+
+@pytest.mark.parametrize(
+    "settings", [FlowSettings(outlets="resistance"), FlowSettings(profile="womersley", waveform=OLDER_ADULT_ICA)]
+)
+def test_a_plug_in_without_these_ends_is_refused(settings: FlowSettings, monkeypatch: pytest.MonkeyPatch) -> None:
+    check_engine(settings)
+    monkeypatch.setattr(OpenFoam, "has_all_ends", False)
+    with pytest.raises(InputError, match="the engine openfoam does not support --"):
+        check_engine(replace(settings, numerics=Numerics(engine="openfoam")))
+
+
+def test_a_profile_that_pulsates_is_mapped_at_every_moment_of_all_cycles() -> None:
+    files = foam_case(with_profile("womersley", is_pulse=True), SETUP).files
+    period_s = OLDER_ADULT_ICA.period_s
+    by_time = {float(name.split("/")[3]): name for name in files if name.endswith("/U") and "inlet/" in name}
+    times_s = np.array(sorted(by_time))
+    names = [by_time[time_s] for time_s in times_s.tolist()]
+    np.testing.assert_allclose(times_s, period_s * np.arange(161) / 40, atol=1e-6)
+    inlet, area_m2 = case().vessel.inlet, case().vessel.inlet.area_mm2 * 1e-6
+    means = np.array([-vectors(files[name])[-1] @ inlet.normal for name in names]) * area_m2 * 1e6
+    np.testing.assert_allclose(means, FLOW_ML_S * OLDER_ADULT_ICA.factor(times_s), rtol=0.02)
+    first, again = (vectors(files[names[k]]) for k in (8, 48))
+    np.testing.assert_allclose(first, again, atol=1e-6)
+    condition = parse(files["0/U"])["boundaryField"]["inlet"]
+    assert condition["type"] == ["timeVaryingMappedFixedValue"]
+
+
+def test_resistances_prescribe_the_flow_without_a_device() -> None:
+    files = foam_case(case("resistance"), SETUP).files
+    velocity, pressure = (parse(files[f"0/{name}"])["boundaryField"] for name in ("U", "p"))
+    assert pressure["outlet_1"]["type"] == ["fixedValue"]
+    assert velocity["outlet_2"]["type"] == ["flowRateOutletVelocity"]
+    asked = case("resistance").resistances[1].mean_mL_s
+    np.testing.assert_allclose(pairs(files["constant/flow_outlet_2"])[:, 1], 1e-6 * asked)
+    assert "The outlets have resistances." in files["README"]
+    assert "resistances" not in foam_case(case(), SETUP).files["README"]
 
 
 @pytest.mark.parametrize("is_pulse", [False, True])

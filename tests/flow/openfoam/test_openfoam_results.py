@@ -19,6 +19,7 @@ from vstent.devices.catalogue import find_design
 from vstent.errors import FlowError, ReadError
 from vstent.flow import domain, sampling
 from vstent.flow.case import PHASES, Sheet, Target
+from vstent.flow.ends import Resistance, outflows
 from vstent.flow.engines import Outcome, Progress, run
 from vstent.flow.openfoam import folder as folders
 from vstent.flow.openfoam import program, results, scatter
@@ -214,6 +215,22 @@ RADIUS_MM, LENGTH_MM, FLOW_ML_S = 2.0, 14.0, 3.0
 
 def tube() -> Vessel:
     return trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=LENGTH_MM, radius_mm=RADIUS_MM))))
+
+
+@pytest.mark.skipif(shutil.which("simpleFoam") is None, reason="OpenFOAM is not installed (apt-get install openfoam)")
+def test_openfoams_flow_follows_resistances(tmp_path: Path) -> None:
+    """Resistances as small as those of the vessel: the flow is far from the shares that it begins with."""
+    straight = phantoms.tube(length_mm=14.0, radius_mm=2.0)
+    phantom = phantoms.with_branch(straight, abscissa_mm=6.0, direction=[1, 0, 1], radius_mm=1.2, length_mm=7.0)
+    case = vessel_case(trace(Vessel(phantoms.phantom_surface(phantom))), FlowSettings(inflow_mL_s=1.0))
+    ends = tuple(Resistance(0.5, 100.0, resistance_Pa_s_mL=whole) for whole in (100.0, 200.0))
+    case = replace(case, ends=(case.ends[0], *ends))
+    field = run(OpenFoam(0.5, tmp_path / "case"), case)
+    assert field.is_converged
+    flow_mL_s, common_Pa = outflows(ends, np.ones(1), field.outlet_pressure_Pa[None])
+    assert field.outlets_mL_s == pytest.approx(flow_mL_s[0], abs=1e-3)
+    assert field.common_pressure_Pa == pytest.approx(common_Pa[0])
+    assert field.outlets_mL_s[1] < 0.31  # less than a third: its arm resists too
 
 
 @pytest.mark.skipif(shutil.which("simpleFoam") is None, reason="OpenFOAM is not installed (apt-get install openfoam)")

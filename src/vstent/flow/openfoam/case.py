@@ -20,6 +20,13 @@ SCRIPTS: Final = ("Allrun", "Allclean", "submit.slurm")
 """Scripts of a case; their texts and that of its README are in the folder ``exported``."""
 
 
+RESISTING_NOTE: Final = """\
+The outlets have resistances. constant/flow_outlet_2, ... hold the flow without a device; outlet_1 takes the rest.
+With a device, vstent run --engine openfoam adjusts these files between its checks. ./Allrun does not.
+"""
+"""What the README says of resistances: OpenFOAM itself would need a compiler for them."""
+
+
 @dataclass(frozen=True, eq=False)
 class FoamCase:
     """The files of an OpenFOAM case."""
@@ -83,6 +90,7 @@ def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
         "inlets": ", ".join(inlet.role for inlet in case.vessel.inlets),
         "density": f"{case.blood.density_kg_m3:.6g}",
         "inflow": f"{case.inflow_mL_s:.6g}",
+        "resisting": RESISTING_NOTE if case.resistances else "",
     }
     texts = {name: (resources.files(__package__) / "exported" / name).read_text() for name in ("README", *SCRIPTS)}
     files = {

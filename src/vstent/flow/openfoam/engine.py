@@ -8,16 +8,18 @@ from collections import deque
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 
 from vstent.errors import FlowError
 from vstent.flow import domain as domains
 from vstent.flow.case import PHASES, FlowCase, FlowField, Level, Phase
+from vstent.flow.ends import outflows
 from vstent.flow.engines import AbstractEngine, Outcome, Saved
 from vstent.flow.openfoam import folder as folders
 from vstent.flow.openfoam import program, results
+from vstent.flow.openfoam.boundary import cycle_s
 from vstent.flow.openfoam.bridge import Bridge, Snapshot, bridge, read
 from vstent.flow.openfoam.case import foam_case, strut_solids
 from vstent.flow.openfoam.cost import memory_bytes, tell_cost
@@ -27,6 +29,8 @@ from vstent.kernels.arrays import Floats, Ints
 
 CHECKS_AVERAGED: Final = 8
 """Number of last checks that are averaged if a steady flow does not converge."""
+SETTLED: Final = 1e-4
+"""Largest change of the flow through a resistance, over the inflow, at which a flow may have converged."""
 CHECKS_HELD: Final = 3
 """Number of first checks at which the inflow is corrected for the meshed area of each inlet."""
 
@@ -91,6 +95,7 @@ class OpenFoam(AbstractEngine[State]):
     folder resumes from the last time written. A stent is meshed as its struts over necks and ostia.
     """
 
+    has_all_ends: ClassVar[bool] = True
     layers: int = 2
     """Number of flat cell layers along the wall."""
     grid_size_mm: float | None = None
@@ -136,7 +141,9 @@ class OpenFoam(AbstractEngine[State]):
         said = program.run(state.found, state.folder, [state.application], processes=state.setup.processes)
         state.loop_seconds += perf_counter() - began
         state.add_check(results.times(state.folder)[-1])
-        state.is_settled = not _correct_inflow(state) and "solution converged" in said
+        is_corrected = _correct_inflow(state)
+        moved = _follow(state)
+        state.is_settled = not is_corrected and moved < SETTLED and "solution converged" in said
         return state
 
     def terminate(self, state: State) -> float:
@@ -183,6 +190,10 @@ class OpenFoam(AbstractEngine[State]):
         pressure_Pa = mean("pressure_Pa")
         inlet_Pa, outlet_Pa = vessel.of_inlets_and_outlets(domains.section_pressure_Pa(vessel, domain, pressure_Pa))
         backwards_mL_s, outlets_mL_s = vessel.of_inlets_and_outlets(mean("outflow_mL_s"))
+        common_Pa = 0.0
+        if ends := state.case.resistances:
+            inflow_mL_s = np.array([state.case.inflow_mL_s])
+            common_Pa = float(outflows(ends, inflow_mL_s, np.nan_to_num(outlet_Pa)[None])[1][0])
         speed_m_s = shear_Pa = None
         if phase_s is None and len(snapshots) > 1:  # checks of a steady solver that did not converge
             speeds_m_s = [np.linalg.norm(one.velocity_m_s, axis=1) for one in snapshots]
@@ -213,6 +224,7 @@ class OpenFoam(AbstractEngine[State]):
             updates_per_s=state.bridge.n_cells * steps / max(state.loop_seconds, 1e-9),
             phases=tuple(phases),
             mean_shear_Pa=shear_Pa,
+            common_pressure_Pa=common_Pa,
             neck_inflow_mL_s=float(mean("neck_inflow_mL_s")),
         )
 
@@ -230,6 +242,30 @@ def _correct_inflow(state: State) -> bool:
         if abs(factor - 1) > 1e-5
     ]
     return any(scaled)
+
+
+def _follow(state: State) -> float:
+    """Adjust the flow through resistances to the pressures at the outlets; return the largest change over the inflow.
+
+    This is done at every check of a steady flow, and after every cycle of a pulse.
+    """
+    case, count = state.case, len(state.snapshots) if state.phase_s else 1
+    if len(case.resistances) < 2 or (state.phase_s and (count < PHASES or state.phases_done % PHASES)):
+        return 0.0
+    last = list(state.snapshots)[-count:]
+    time_s = np.array([float(one.time) for one in last])
+    sections_Pa = [domains.section_pressure_Pa(case.vessel, state.domain, one.pressure_Pa) for one in last]
+    at_outlets_Pa = np.nan_to_num(sections_Pa)[:, len(case.vessel.inlets) :]
+    period_s = np.inf if case.waveform is None else case.waveform.period_s
+    inflow_mL_s = case.inflow_mL_s * case.inflow_factor(time_s)
+    flow_mL_s, moved = outflows(case.resistances, inflow_mL_s, at_outlets_Pa, period_s)[0], 0.0
+    for k, outlet in enumerate(case.vessel.outlets[1:], start=1):
+        table_s = cycle_s(case)
+        finer = np.interp(table_s, time_s % table_s[-1], flow_mL_s[:, k], period=table_s[-1])
+        folders.set_outflow(state.folder, outlet.role, table_s, finer)
+        through_mL_s = [one.outflow_mL_s[len(case.vessel.inlets) + k] for one in last]
+        moved = max(moved, float(np.abs(flow_mL_s[:, k] - through_mL_s).max()) / case.inflow_mL_s)
+    return moved
 
 
 def _advice(state: State, outcome: Outcome) -> str:
