@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from vstent.anatomy.morphology import morphology as morphology
     from vstent.anatomy.read import read_vessel as read_vessel
+    from vstent.anatomy.restore.paths import on_path as on_path
     from vstent.anatomy.restore.restore import restore as restore
     from vstent.anatomy.segment import segment as segment
     from vstent.anatomy.trace import trace as trace
@@ -48,6 +49,7 @@ _HOMES = {
     "trace": "vstent.anatomy.trace",
     "trim": "vstent.anatomy.trim",
     "restore": "vstent.anatomy.restore.restore",
+    "on_path": "vstent.anatomy.restore.paths",
     "morphology": "vstent.anatomy.morphology",
     "catalogue": "vstent.devices.catalogue",
     "find_design": "vstent.devices.catalogue",

@@ -237,6 +237,7 @@ def test_a_second_tab_cannot_undo_what_the_first_has_done(client, case):
         {"treatments": [{"name": "silk", "implants": []}]},
         {"treatments": [alone("silk", nonsense=1)]},
         {"treatments": [alone("silk", inside=["enterprise"])]},
+        {"treatments": [alone("silk", placing={"path": "outlet_2"})]},
         {"treatments": [{"name": "../silk", "implants": SILK["implants"]}]},
         {"inlet_mm": [1.0, 2.0]},
         {"inlet_mm": [1.0, 2.0, 1e9]},
@@ -458,12 +459,18 @@ def test_of_two_implants_the_inner_opens_in_the_outer_and_is_deployed_again_wher
     assert (refused.status_code, "not among the implants" in refused.json()["detail"]) == (422, True)
 
 
-def test_a_basket_is_left_to_the_command_line(client, case):
-    words = "web_sl is a basket: plan it with vstent run on the command line"
+@pytest.mark.parametrize(
+    ("treatment", "words"),
+    [
+        (alone("web_sl"), "web_sl is a basket: plan it with vstent run on the command line"),
+        (alone("silk", placing={"beside": ["outlet_2"]}), "silk lies at a fork: plan it with vstent run"),
+    ],
+)
+def test_baskets_and_stents_at_a_fork_are_left_to_the_command_line(client, case, treatment, words):
     for refused in (
-        choose(client, case, treatments=[alone("web_sl")]),
-        client.post(f"{case}/deployment", json=wanted(alone("web_sl"))),
-        client.post(f"{case}/sketch", json=wanted(alone("web_sl"))),
+        choose(client, case, treatments=[treatment]),
+        client.post(f"{case}/deployment", json=wanted(treatment)),
+        client.post(f"{case}/sketch", json=wanted(treatment)),
     ):
         assert refused.status_code == 422
         assert words in refused.text

@@ -3,6 +3,7 @@
 import pytest
 from rich.table import Table
 
+from vstent.cli import main
 from vstent.cli.console import _state, comparison_table, flow_table, opening_table
 from vstent.geometry.vessel import Opening
 from vstent.study.progress import Progress
@@ -81,3 +82,17 @@ def test_what_one_device_lacks_leaves_its_cell_empty_and_what_all_lack_has_no_ro
     names, *cells = columns(comparison_table({"treatments": treatments}))
     assert names == ["Size (label)", "Apposed"]
     assert cells == [["", ""], ["3.5 x 15 mm", "91.7 %"], ["4.5 x 22 mm", ""]]
+
+
+def test_devices_are_listed_by_use_and_found_by_maker(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["devices"]) == 0
+    told = capsys.readouterr().out
+    places = [told.index(title) for title in ("Flow diverters:", "Stents for coils:", "Baskets for the sac;")]
+    assert places[0] < told.index(" pipeline ") < places[1] < told.index(" leo ") < places[2] < told.index(" contour ")
+    assert main(["devices", "--find", "cerus"]) == 0
+    told = capsys.readouterr().out
+    assert "contour" in told
+    assert "1 of 7" in told
+    assert "Flow diverters" not in told
+    assert main(["devices", "--find", "no such"]) == 2
+    assert "No device has 'no such'" in capsys.readouterr().err

@@ -8,7 +8,11 @@ from brute import BruteWall, least_gap_mm
 from forks import PHANTOM, arm, fork
 from scipy.spatial import cKDTree
 
+from vstent.anatomy.read import read_vessel
 from vstent.anatomy.restore.paths import on_path
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.trace import trace
+from vstent.anatomy.trim import trim
 from vstent.deployment.coverage import together
 from vstent.deployment.forks import CATHETER_MM, passage
 from vstent.deployment.measure import measure
@@ -155,3 +159,26 @@ def test_metal_over_a_neck_at_a_fork_is_that_of_both_stents():
 def test_what_cannot_be_is_refused_with_a_sentence(text, match):
     with pytest.raises(LandingError, match=match):
         treated(text)
+
+
+@pytest.mark.validation
+@pytest.mark.parametrize(
+    ("case", "stent"), [("C0011", "enterprise 4.5x14"), ("C0091", "neuroform_atlas 3x15")], ids=["acom", "basilar"]
+)
+@pytest.mark.parametrize("sign", ["+", "|"])
+def test_no_wire_passes_through_another_at_the_forks_of_patients(shared_data, case, stent, sign):
+    anatomy = restore(trim(trace(read_vessel(shared_data / "aneurisk" / f"{case}.vtp"))))
+    found = {}
+    for implant in read_treatment(f"{stent} > outlet_2 {sign} {stent} > outlet_3").implants:
+        found[implant.id] = deploy_implant(implant, anatomy, [found[name].stent for name in implant.inside])
+        assert measure(anatomy, found[implant.id])["max_outside_mm"] <= 0.002
+    assert least_gap_mm(*(one.stent for one in found.values())) >= 0
+
+
+@pytest.mark.validation
+def test_a_cell_that_a_tight_bend_has_closed_is_refused(shared_data):
+    anatomy = restore(trace(read_vessel(shared_data / "bifurcation_with_sac.stl")))
+    first, second = read_treatment(Y).implants
+    done = deploy_implant(first, anatomy)
+    with pytest.raises(LandingError, match=r"is 0.43 mm wide, and a microcatheter 0.7 mm"):
+        deploy_implant(second, anatomy, [done.stent])

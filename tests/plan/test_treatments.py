@@ -1,10 +1,12 @@
 """Treatments are ranked by their flows, with the branches that they jail by name."""
 
 import json
+from types import SimpleNamespace
 
 import pytest
 from forks import arm, fork
 
+from vstent.cli import main
 from vstent.deployment.deploy import deploy
 from vstent.deployment.measure import branches, jailed_branches, measure
 from vstent.devices.catalogue import find_design, find_size
@@ -67,3 +69,33 @@ def test_a_stent_over_a_fork_jails_the_other_arm_by_name_and_its_metal_is_that_o
     assert set(jailed_branches(fork(), [across.stent])) <= {"outlet_1", "outlet_2"}
     area_mm2 = done.stent.wire_length_mm * 0.078
     assert measure(fork(), done)["metal_in_artery_mm2"] == pytest.approx(area_mm2)
+
+
+@pytest.fixture
+def ranked(monkeypatch, tmp_path):
+    """Runs `vstent rank` with treatments whose study has these metrics; returns the exit code."""
+
+    def command(metrics, *options):
+        case = SimpleNamespace(metrics=metrics, failures={})
+        monkeypatch.setattr("vstent.study.pipeline.run", lambda *_, **__: case)
+        return main(["rank", "a.stl", "--out", str(tmp_path), "--treatment", "silk", "--treatment", "leo", *options])
+
+    return command
+
+
+def test_the_command_prints_the_treatments_with_their_reasons_and_writes_them(ranked, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    rows = rank_treatments({"a": treatment(-0.33, -0.3, jailed={"outlet_2": -0.1}), "b": treatment(-0.7, -0.7)})
+    assert ranked({"ranking": rows}) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "outlet_2 -10%" in told
+    assert "1. b: Meets almost every criterion in full." in told
+    kept = json.loads((tmp_path / "treatments.json").read_text())
+    assert [(row["treatment"], row["reason"]) for row in kept] == [(row["treatment"], row["reason"]) for row in rows]
+
+
+def test_the_command_says_that_one_treatment_is_not_ranked_and_refuses_options_of_sizes(ranked, capsys):
+    assert ranked({}) == 1
+    assert "give at least two treatments" in capsys.readouterr().err
+    assert ranked({}, "--flow", "3") == 2
+    assert "give only settings of those" in capsys.readouterr().err

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Final, Self, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model, field_validator, model_validator
 
 from vstent.devices.catalogue import baskets
-from vstent.devices.treatment import Placing, Treatment
+from vstent.devices.treatment import Treatment
 from vstent.fields import POSITION, Option, check_all
 from vstent.flow.measured import MeasuredProfile
 from vstent.flow.settings import FlowSettings, Numerics
@@ -153,8 +153,8 @@ class Choices(OfVessel):
             for implant in treatment.implants:
                 if implant.device.casefold() in baskets():
                     raise ValueError(f"{implant.device} is a basket: plan it with vstent run on the command line")
-                if implant.placing.path != Placing.path or implant.placing.beside or implant.placing.at_fork:
-                    raise ValueError("stents at a fork are planned with vstent run on the command line")
+                if implant.placing.is_at_fork:
+                    raise ValueError(f"{implant.device} lies at a fork: plan it with vstent run on the command line")
                 check_all(implant)
         return treatments
 

@@ -142,7 +142,9 @@ class Preview:
         return self._cached(("wall", self.case.state.anatomy, path, *asked, *_before(treatment, implant)), prepare)
 
     def _outer(self, treatment: Treatment, implant: Implant) -> list[Stent]:
-        """Return the deployed devices inside which an implant opens; a DeviceError says that it is a basket."""
+        """Return the deployed devices inside which an implant opens; a DeviceError says what the page cannot show."""
+        if implant.placing.is_at_fork:
+            raise DeviceError(f"{implant.device} lies at a fork: plan it with vstent run on the command line.")
         if implant.device.casefold() in baskets():
             raise DeviceError(f"{implant.device} is a basket: plan it with vstent run on the command line.")
         return [self.deployment(treatment, _implant(treatment, name)).stent for name in implant.inside]

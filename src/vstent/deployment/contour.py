@@ -86,7 +86,7 @@ def planes(axis: Centerline) -> Planes:
         normals = _smooth(normals, sigma_mm / STEP_MM)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         sigma_mm *= 1.4
-    return Planes(abscissa_mm, centers_mm, _untwisted(normals, centers_mm.mean(axis=0) - centers_mm[0]))
+    return Planes(abscissa_mm, centers_mm, untwisted(normals, centers_mm.mean(axis=0) - centers_mm[0]))
 
 
 def _smooth(values: Floats, sigma: float) -> Floats:
@@ -97,7 +97,7 @@ def _smooth(values: Floats, sigma: float) -> Floats:
     return gaussian_filter1d(np.concatenate([before, values, after]), sigma, axis=0)[pad : pad + len(values)]
 
 
-def _untwisted(normals: Floats, start: Floats) -> Floats:
+def untwisted(normals: Floats, start: Floats) -> Floats:
     """Return frames (n, 3, 3) that do not twist, their first in-plane axis starting along `start`."""
     # Starting along a direction of the artery makes the frames turn with it when the artery is rotated.
     frames = np.zeros((len(normals), 3, 3))

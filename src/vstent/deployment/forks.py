@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter, minimum_filter
 from scipy.spatial import cKDTree
 
 from vstent.anatomy.restore.paths import on_path
-from vstent.deployment.contour import bilinear, normals, planes
+from vstent.deployment.contour import bilinear, normals, planes, untwisted
 from vstent.deployment.coverage import pore_areas_mm2, pore_places
 from vstent.deployment.wall import TreeWall, inner_nodes_mm, landing_wall
 from vstent.devices.design import Braid
@@ -93,16 +93,16 @@ def _cell(stent: Stent, row: float, column: float) -> Passage:
     fine = np.linspace(-0.5, 0.5, 21)
     rows, columns = (values.ravel() for values in np.meshgrid(row + fine, column + fine, indexing="ij"))
     charts = np.concatenate([stent.nodes_mm, normals(stent.nodes_mm)], axis=2)
-    found = bilinear(charts, rows * shape.row_split, columns * shape.column_split)
+    places = bilinear(charts, rows * shape.row_split, columns * shape.column_split)
     starts_mm, ends_mm, half_mm = stent.pieces_mm
-    middle_mm = found[:, :3].mean(axis=0)
+    middle_mm = places[:, :3].mean(axis=0)
     is_near = curves.lengths(starts_mm - middle_mm) < 2 * stent.spacing_mm
     along = np.linspace(0.0, 1.0, 5)[:, None, None]
     wires_mm = (starts_mm + along * (ends_mm - starts_mm))[:, is_near].reshape(-1, 3)
-    clear_mm = cKDTree(wires_mm).query(found[:, :3])[0] - half_mm.max()
+    clear_mm = cKDTree(wires_mm).query(places[:, :3])[0] - half_mm.max()
     best = int(clear_mm.argmax())
-    outward = found[best, 3:] / np.linalg.norm(found[best, 3:])
-    return Passage(found[best, :3], outward, float(clear_mm[best]))
+    outward = places[best, 3:] / np.linalg.norm(places[best, 3:])
+    return Passage(places[best, :3], outward, float(clear_mm[best]))
 
 
 class Way(NamedTuple):
@@ -163,23 +163,15 @@ def way(anatomy: Anatomy, inside: Sequence[Stent] = (), beside: Sequence[str] = 
         share = np.exp(-(((axis.abscissa_mm - here_mm) / STRAIGHT_MM) ** 2))[:, None]
         ahead = (1 - share) * ahead + share * cell.outward
         ahead /= curves.lengths(ahead)[:, None]
-    rays = _rays(ahead)
+    angle = 2 * np.pi * np.arange(N_RAYS) / N_RAYS
+    frames = untwisted(ahead, centers_mm.mean(axis=0) - centers_mm[0])
+    rays = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ frames[:, 1:]
     origins_mm = np.repeat(centers_mm, N_RAYS, axis=0)
     wall_mm, face = path.landing_surface.first_hits(origins_mm, rays.reshape(-1, 3))
     wall_mm = wall_mm.reshape(-1, N_RAYS)
     section_mm = np.interp(plain_mm, path.axis.abscissa_mm, path.section_radius_mm)[:, None]
     wall_mm = np.where(np.isfinite(wall_mm), wall_mm, section_mm)  # at the open ends
-    limit_mm = np.full_like(wall_mm, np.inf)
-    if others:
-        faces = joined([_face(nodes_mm) for stent in others for nodes_mm in _faces_mm(stent)])
-        limit_mm = faces.first_hit(origins_mm, rays.reshape(-1, 3)).reshape(-1, N_RAYS) - SPARE_MM
-    for (stent, cell), here_mm in zip(waists, at_mm, strict=True):
-        from_mm = np.abs(axis.abscissa_mm - here_mm)[:, None]
-        deep_mm = _depth_mm(stent)
-        waist_mm = cell.radius_mm - SPARE_MM
-        sunk_mm = waist_mm**2 / stent.row_diameter_mm.mean() + deep_mm  # a round wall falls away from its tangent plane
-        limit_mm = np.where(from_mm < sunk_mm, np.maximum(limit_mm, waist_mm), limit_mm)
-        limit_mm = np.minimum(limit_mm, waist_mm + OPENING * np.maximum(from_mm - deep_mm, 0.0))
+    limit_mm = _limit_mm(axis.abscissa_mm, origins_mm, rays, others, list(zip(waists, at_mm, strict=True)))
     for name in beside:
         limit_mm = np.minimum(limit_mm, _share_mm(centers_mm, rays, path, on_path(anatomy, name).parent))
     rho_mm = np.minimum(wall_mm, limit_mm)
@@ -204,6 +196,31 @@ def way(anatomy: Anatomy, inside: Sequence[Stent] = (), beside: Sequence[str] = 
     return Way(
         derived, *landing_wall(derived, same, np.asarray(own[surface.faces].all(axis=1))), plain_mm, nested_to_mm
     )
+
+
+def _limit_mm(
+    abscissa_mm: Floats,
+    origins_mm: Floats,
+    rays: Floats,
+    others: Sequence[Stent],
+    waists: Sequence[tuple[tuple[Stent, Passage], float]],
+) -> Floats:
+    """Return the length (n, rays) of rays up to the faces of other stents, and within cones about their cells.
+
+    `waists` are the stents that are passed, their cells and the arc lengths of these, in mm, on the axis.
+    """
+    limit_mm = np.full(rays.shape[:2], np.inf)
+    if others:
+        faces = joined([_face(nodes_mm) for stent in others for nodes_mm in _faces_mm(stent)])
+        limit_mm = faces.first_hit(origins_mm, rays.reshape(-1, 3)).reshape(rays.shape[:2]) - SPARE_MM
+    for (stent, cell), here_mm in waists:
+        from_mm, waist_mm = np.abs(abscissa_mm - here_mm)[:, None], cell.radius_mm - SPARE_MM
+        inner_mm, outer_mm = _faces_mm(stent)
+        depth_mm = float(curves.lengths(outer_mm - inner_mm).max())
+        sunk_mm = waist_mm**2 / stent.row_diameter_mm.mean() + depth_mm  # of a round wall below its tangent plane
+        limit_mm = np.where(from_mm < sunk_mm, np.maximum(limit_mm, waist_mm), limit_mm)
+        limit_mm = np.minimum(limit_mm, waist_mm + OPENING * np.maximum(from_mm - depth_mm, 0.0))
+    return limit_mm
 
 
 def _check(stent: Stent, cell: Passage) -> None:
@@ -245,24 +262,6 @@ def _faces_mm(stent: Stent) -> tuple[Floats, Floats]:
 def _face(nodes_mm: Floats) -> Surface:
     """Return a face of a stent (rows, columns, 3) as a surface."""
     return Surface(nodes_mm.reshape(-1, 3), tube_faces(*nodes_mm.shape[:2]))
-
-
-def _depth_mm(stent: Stent) -> float:
-    """Return the distance between the inner and the outer face of a stent, in mm."""
-    inner_mm, outer_mm = _faces_mm(stent)
-    return float(curves.lengths(outer_mm - inner_mm).max())
-
-
-def _rays(ahead: Floats) -> Floats:
-    """Return unit vectors (n, rays, 3) across directions (n, 3), without twist."""
-    first = curves.any_perpendicular(ahead[0])
-    across = np.zeros((len(ahead), 2, 3))
-    for k, normal in enumerate(ahead):
-        first = first - (first @ normal) * normal
-        first = first / np.linalg.norm(first)
-        across[k] = first, np.cross(normal, first)
-    angle = 2 * np.pi * np.arange(N_RAYS) / N_RAYS
-    return np.asarray(np.stack([np.cos(angle), np.sin(angle)], axis=1) @ across)
 
 
 def _aside(axis_mm: Floats, path: Path, other: Path) -> Floats:

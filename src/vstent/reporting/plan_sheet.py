@@ -164,8 +164,9 @@ def _size_rows(case: Planned, stent: Stent, metrics: Mapping[str, Any]) -> Seque
     """Return the size of a device as it lies and its two best neighboring sizes, with their scores and reasons."""
     if isinstance(stent.design, Basket):
         return [("not ranked", "", "Sizes of baskets are not ranked.")]
-    measures = {**metrics, **landing_measures(case.anatomy, dict(metrics))}
+    anatomy = on_path(case.anatomy, stent.path)
+    measures = {**metrics, **landing_measures(anatomy, dict(metrics))}
     own = graded_anew(Candidate(stent.design, stent.size, 0.0, measures, {}, 0.0, False, ""), default_criteria())
     found = [(f"{own.size.label} (this)", own)]
-    found += [(one.size.label, one) for one in alternatives(case.anatomy, stent.design, stent.size)]
+    found += [(one.size.label, one) for one in alternatives(anatomy, stent.design, stent.size)]
     return [(title, f"{100 * one.score:.0f}" if one.is_suitable else "unsuitable", one.reason) for title, one in found]
