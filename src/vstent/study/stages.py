@@ -34,10 +34,10 @@ from vstent.flow.case import FlowField
 from vstent.flow.ends import ASSUMED
 from vstent.flow.engines import Progress as FlowProgress
 from vstent.flow.grade import computation_of, grade
-from vstent.flow.indices import balance, indices, ratios
+from vstent.flow.indices import balance, between_coils, indices, ratios
 from vstent.flow.ostium import sac_surfaces
 from vstent.flow.problem import flow_case, vessel_case
-from vstent.flow.settings import FlowSettings
+from vstent.flow.settings import OPENFOAM, FlowSettings
 from vstent.flow.simulation import foretell_cost, simulate_case
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.files import is_surface_file
@@ -384,7 +384,7 @@ def measure_study(
     if fields:
         case = flow_case(anatomy, (), settings.flow)
     for name, field in fields.items():
-        flow = indices(field, *shapes)
+        flow = between_coils(indices(field, *shapes), _porosity(implants.get(name, {}), settings.flow))
         judged = grade(case, field, flow)
         left = {"unsettled_fraction": field.unsettled_fraction} if isfinite(field.unsettled_fraction) else {}
         of_flow = case if name == BARE else case.resisted_as(fields[BARE])
@@ -420,6 +420,13 @@ def measure_treatment(anatomy: Anatomy, deployed: Mapping[str, Deployment]) -> d
         "jailed_branches": list(jailed_branches(anatomy, stents)),
     }
     return found | ({"together": together(anatomy, stents)} if len(stents) > 1 else {})
+
+
+def _porosity(deployed: Mapping[str, Deployment], flow: FlowSettings | None) -> float:
+    """Return blood's part of a sac in which coils are a porous region in the flow; 1 where there are none."""
+    if flow is None or flow.numerics.resolve_wires or flow.numerics.engine == OPENFOAM:
+        return 1.0
+    return 1.0 - sum(one.stent.density_fraction for one in deployed.values() if isinstance(one.stent, Coils))
 
 
 def neck_notes(metrics: Mapping[str, Any]) -> tuple[str, ...]:
