@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from vstent.flow.case import Sheet
-from vstent.flow.drag import concentration, drag_per_length
+from vstent.flow.drag import FORCHHEIMER, concentration, drag_per_length
+from vstent.flow.drag import permeability_mm2 as permeability_mm2_of
 from vstent.flow.lattice.kernels import d3q19, lanes
 from vstent.flow.lattice.scales import ODD_RATE
 from vstent.flow.lattice.screen import on_grid
@@ -38,7 +39,8 @@ def entries(media: tuple[Sheet, ...]) -> tuple[np.ndarray, np.ndarray]:
     spread = on_grid(media, index, np.full(3, -1e3 * CELL_M), 1e3 * CELL_M)
     linear = np.stack([spread.along_Pa_s_m2, spread.across_Pa_s_m2], axis=1) * STEP_S / DENSITY_KG_M3
     twice = spread.spread_Pa_s_m / DENSITY_KG_M3 * STEP_S / CELL_M
-    return spread.cell, np.column_stack([spread.normal, linear, 0 * twice, twice]).astype(np.float32)
+    inertial = spread.inertial_per_m * CELL_M
+    return spread.cell, np.column_stack([spread.normal, linear, inertial, twice]).astype(np.float32)
 
 
 def row(diameter_mm: float, spacing: int, offset: float) -> Sheet:
@@ -239,3 +241,50 @@ def test_wires_that_the_grid_tells_apart_hold_slow_blood_up_as_their_row_does(
     else:
         pytest.fail("the flow through the row has not settled")
     assert now == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize("way", [(0.0, 0.0, 1.0), (0.6, 0.0, 0.8)])
+@pytest.mark.parametrize("density", [0.15, 0.3])
+def test_a_region_resists_alike_in_all_directions_with_inertia(density: float, way: tuple[float, float, float]) -> None:
+    """Darcy and Forchheimer: mu u / K + rho beta |u| u is the pressure gradient that drives the blood."""
+    permeability_mm2 = float(permeability_mm2_of(np.array(density), 0.3))
+    places = np.argwhere(np.ones(SHAPE, bool)) + 0.3
+    alike, cell_mm = np.ones(len(places)), 1e3 * CELL_M
+    viscous_Pa_s_m = DENSITY_KG_M3 * VISCOSITY_M2_S / permeability_mm2 * 1e3 * alike
+    loss = 4 * FORCHHEIMER / np.sqrt(permeability_mm2) * alike
+    region = Sheet(
+        cell_mm * places,
+        np.zeros((len(places), 3)),
+        cell_mm**3 * alike,
+        viscous_Pa_s_m,
+        viscous_Pa_s_m,
+        loss,
+        alike,
+        alike,
+    )
+    speed_m_s = 0.1
+    gradient_Pa_m = DENSITY_KG_M3 * VISCOSITY_M2_S * speed_m_s / (permeability_mm2 * 1e-6)
+    gradient_Pa_m += DENSITY_KG_M3 * FORCHHEIMER * speed_m_s**2 / (np.sqrt(permeability_mm2) * 1e-3)
+    force = gradient_Pa_m / DENSITY_KG_M3 * STEP_S**2 / CELL_M * np.array(way)
+    box = Box((region,), force, np.zeros((np.prod(SHAPE), 3)))
+    box.advance(2500)
+    found_m_s = box.velocity() * CELL_M / STEP_S
+    np.testing.assert_allclose(found_m_s, np.tile(speed_m_s * np.array(way), (len(places), 1)), atol=0.005 * speed_m_s)
+
+
+def test_a_region_and_a_sheet_in_one_cell_add() -> None:
+    """The region is in half of the cells of the sheet, and alone in others, where it has no axis."""
+    sheet = samples(np.array([0.0, 0.0, 1.0]), 60.0, 0.0)
+    places = np.argwhere(np.ones(SHAPE, bool)) + 0.0
+    alike = np.ones(len(places))
+    region = Sheet(
+        1e3 * CELL_M * places, np.zeros((len(places), 3)), 1e-3 * alike, alike, alike, 0 * alike, alike, alike
+    )
+    alone, both = dict(zip(*entries((sheet,)), strict=True)), dict(zip(*entries((region, sheet)), strict=True))
+    of_region = dict(zip(*entries((region,)), strict=True))
+    for cell, (*normal, along, across, _, spread) in both.items():
+        mine = alone.get(cell, np.zeros(7))
+        assert along == pytest.approx(mine[3] + of_region[cell][3], rel=1e-5)
+        assert across == pytest.approx(mine[4] + of_region[cell][4], rel=1e-5)
+        np.testing.assert_allclose(np.abs(normal), np.abs(mine[:3]), atol=1e-6)
+        assert spread <= mine[6] + 1e-9

@@ -30,8 +30,8 @@ STATED = {
     "upstream": ("9", Settings(anatomy=AnatomySettings(upstream_mm=9.0))),
     "downstream": ("8", Settings(anatomy=AnatomySettings(downstream_mm=8.0))),
     "treatment": (
-        "two=silk 4x20 + silk@-4; pipeline",
-        Settings(treatments=(read_treatment("two=silk 4x20 + silk@-4"), with_device("pipeline"))),
+        "two=silk 4x20 + silk@-4; coils(20%, seed 3)",
+        Settings(treatments=(read_treatment("two=silk 4x20 + silk@-4"), read_treatment("coils(20%, seed 3)"))),
     ),
     "device": ("silk pipeline", Settings(treatments=(with_device("silk"), with_device("pipeline")))),
     "diameter": ("4.5", Settings(treatments=tuple(with_device(one, diameter_mm=4.5) for one in USUAL))),

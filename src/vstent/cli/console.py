@@ -59,6 +59,9 @@ DEVICE_ROWS: Final = (
     ("Basket, height", "basket_height_mm"),
     ("Basket, stands out into the artery", "protrusion_mm"),
     ("Basket, neck left open", "neck_uncovered_fraction"),
+    ("Coils, packing density", "packing_density_fraction"),
+    ("Coils, length of all", "coil_length_mm"),
+    ("Coils, neck covered", "neck_covered_by_coils_fraction"),
 )
 """Rows of the comparison of deployments: title and key of the measure."""
 

@@ -10,6 +10,7 @@ USES: Final = {
     "flow diverter": "Flow diverters",
     "stent for coils": "Stents for coils",
     "basket": "Baskets for the sac; sizes are width x height",
+    "coils": "Coils for the sac; sizes are diameter of the loops x length",
 }
 """Title of every use of devices."""
 

@@ -10,12 +10,13 @@ from vstent.deployment import forks, sizing, wires
 from vstent.deployment.advice import advise
 from vstent.deployment.basket import deploy_basket
 from vstent.deployment.braid import ConstantWire
+from vstent.deployment.coils import deploy_coils
 from vstent.deployment.method import AbstractMethod, Course, Placement, Progress, Zhong2016, laid_inside, run
 from vstent.deployment.nested import kept_inside
 from vstent.devices.catalogue import find_design
-from vstent.devices.design import Basket, Design, Size
+from vstent.devices.design import Basket, Coil, Design, Size
 from vstent.devices.formulas import compacted
-from vstent.devices.stent import Deployment, Landing, Stent
+from vstent.devices.stent import Coils, Deployment, Landing, Stent
 from vstent.errors import InputError, LandingError
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Floats
@@ -88,6 +89,10 @@ def deploy(  # noqa: PLR0913 one keyword for each thing that can be chosen
     """
     began = time.perf_counter()
     design = find_design(design) if isinstance(design, str) else design
+    if isinstance(design, Coil):
+        return deploy_coils(design, anatomy, inside=inside)
+    if any(isinstance(one, Coils) for one in inside):
+        raise LandingError(f"Coils come last in a treatment: give {design.name} before them.")
     if isinstance(design, Basket):
         if inside:
             raise LandingError(f"{design.name} lies in a sac alone: give it a treatment of its own.")

@@ -9,13 +9,14 @@ from vstent.anatomy.landing_zones import neck_points_mm, neck_span_mm
 from vstent.anatomy.morphology import Measures
 from vstent.anatomy.restore.paths import on_path
 from vstent.deployment.basket import measure_basket
+from vstent.deployment.coils import measure_coils
 from vstent.deployment.coverage import density, quad_areas_mm2
 from vstent.deployment.crowns import free_crowns
 from vstent.deployment.crumpling import crumpling_measures
 from vstent.deployment.sizing import APPOSED_GAP_MM, oversizing_fraction
 from vstent.devices.design import Basket, piece_length_mm
 from vstent.devices.formulas import grid
-from vstent.devices.stent import Deployment, Stent
+from vstent.devices.stent import Coils, Deployment, Stent
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels import curves
 from vstent.kernels.arrays import Floats
@@ -44,6 +45,8 @@ def measure(anatomy: Anatomy, deployment: Deployment) -> Measures:
     density are measured on the drawn wires. The values of the closed formulas at the same mean diameter are listed too.
     """
     anatomy = on_path(anatomy, deployment.stent.path)
+    if isinstance(deployment.stent, Coils):
+        return measure_coils(anatomy, deployment.stent)
     stretch = wire_stretches(deployment.stent)
     p95 = float(np.quantile(np.abs(stretch), 0.95))
     stretches = {"mean_wire_stretch_fraction": float(stretch.mean()), "p95_wire_stretch_fraction": p95}

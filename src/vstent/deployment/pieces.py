@@ -21,7 +21,7 @@ import numpy as np
 from vstent.deployment import cells
 from vstent.deployment.contour import bilinear, normals
 from vstent.deployment.crowns import NO_CROWNS, Crowns, Split, free_crowns, split
-from vstent.devices.design import Design, LaserCut, Size, piece_length_mm
+from vstent.devices.design import Braid, Design, LaserCut, Size, piece_length_mm
 from vstent.devices.formulas import Grid, free_diameters_mm, grid, row_spacing_mm
 from vstent.kernels import net
 from vstent.kernels.arrays import Bools, Floats, Ints
@@ -96,6 +96,7 @@ def slide(
         if divided is not None:
             moves_mm, crowns = _parted(crossings, divided, moves_mm, on_wall, shape)
     else:
+        assert isinstance(design, Braid)
         # The wires of a short cell are nearly perpendicular to the axis: its length is the distance between them.
         mean_mm = sum(count * diameter_um for count, diameter_um in design.wires) / design.n_wires * MM_PER_UM
         shortest_mm = min(JAMMED * mean_mm, 2 * float(row_spacing_mm(design, size, size.free_diameter_mm)))

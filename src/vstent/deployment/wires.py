@@ -51,6 +51,7 @@ def draw(design: Design, size: Size, nodes_mm: Floats, wall: AbstractWall | None
         depth_mm = np.repeat(wires.diameter_um * MM_PER_UM, np.diff(wires.starts))
         is_out = np.zeros(len(depth_mm), dtype=bool)
     else:
+        assert isinstance(design, LaserCut)
         wires, is_out = _laser_cut(design, size, shape, nodes_mm, crowns)
         depth_mm = np.full(len(is_out), design.strut_thickness_um * MM_PER_UM)
     if wall is None:

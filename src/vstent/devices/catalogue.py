@@ -46,12 +46,14 @@ def catalogue() -> dict[str, Design]:
 
 @cache
 def baskets() -> dict[str, Design]:
-    """Read the baskets for sacs, by their key."""
+    """Read the baskets and the coils for sacs, by their key."""
     from importlib.resources import files
 
     from vstent.devices.schema import parse
 
-    return parse(files("vstent.devices").joinpath("baskets.toml").read_text(encoding="utf-8"), "The list of baskets")
+    folder = files("vstent.devices")
+    texts = {name: folder.joinpath(f"{name}.toml").read_text(encoding="utf-8") for name in ("baskets", "coils")}
+    return parse(texts["baskets"], "The list of baskets") | parse(texts["coils"], "The list of coils")
 
 
 def user_folder() -> Path:

@@ -377,8 +377,66 @@ class LaserCut:
         return replace(self, **new | {"n_columns": _even(new["n_columns"]), "sizes": sizes})
 
 
-Design = Braid | LaserCut
-"""A device of either family."""
+@dataclass(frozen=True, eq=False)
+class Coil:
+    """A line of detachable coils for sacs: a thin wire wound to a long spring that curls to loops when it is free.
+
+    Its sizes are the diameter of the free loops x the length of the coil. It has no mesh, and the numbers that all
+    designs have are those of none.
+    """
+
+    key: str
+    """Short lower-case name."""
+    name: str
+    """Name as the maker writes it."""
+    wound_diameter_um: float
+    """Outer diameter of the spring, in um."""
+    stock_wire_um: float
+    """Diameter of the wire that is wound, in um."""
+    sizes: tuple[Size, ...]
+    """Available sizes."""
+    maker: str = ""
+    """Manufacturer."""
+    facts: tuple[Fact, ...] = ()
+    """Source and confidence of every number."""
+    ranges: tuple[Range, ...] = ()
+    """Range of every number."""
+    kind: Literal["coil"] = field(default="coil", init=False)
+    """Device family."""
+
+    use = "coils"
+    follows_bends = True
+    joined_fraction, beyond_mm, layer_um, crown_gap_um, hand_um, angle_rad = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    joined_crowns: ClassVar[tuple[str, ...]] = ()
+    n_columns: ClassVar[int] = 0
+
+    @property
+    def wall_offset_um(self) -> float:
+        """Distance from the wall to the axis of the coil, in um."""
+        return 0.5 * self.wound_diameter_um
+
+    @property
+    def mesh_offset_um(self) -> float:
+        """Distance from the outer face of the coil to its axis, in um."""
+        return self.wall_offset_um
+
+    def covered(self, hand: Fraction, layer: Fraction) -> Fraction:
+        """Return the fraction under metal."""
+        return hand
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """Numbers of the coil by name, as in `Range.name`."""
+        return {"wound_diameter_um": self.wound_diameter_um, "stock_wire_um": self.stock_wire_um}
+
+    def altered(self, values: Mapping[str, float], sizes: tuple[Size, ...]) -> "Coil":
+        """Return the coils in other sizes and with other values of their numbers."""
+        new: dict[str, Any] = self.numbers | dict(values)
+        return replace(self, **new, sizes=sizes)
+
+
+Design = Braid | LaserCut | Coil
+"""A device of any family."""
 
 
 def nth(name: str, number: int) -> str:

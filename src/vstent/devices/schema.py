@@ -7,12 +7,25 @@ from typing import Annotated, Any, Final, Generic, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from vstent.devices.design import Basket, Braid, Confidence, Design, Fact, LaserCut, Range, Size, Strands, called, nth
+from vstent.devices.design import (
+    Basket,
+    Braid,
+    Coil,
+    Confidence,
+    Design,
+    Fact,
+    LaserCut,
+    Range,
+    Size,
+    Strands,
+    called,
+    nth,
+)
 from vstent.devices.ranges import LENGTH
 from vstent.devices.treatment import BARE
 from vstent.errors import DeviceError
 
-LARGEST_MM: Final = 200.0
+LARGEST_MM: Final = 600.0
 """Largest diameter or length of a size that the schema accepts, in mm."""
 MOST_SIZES: Final = 100
 """Largest number of diameters, or of lengths, in one block of sizes."""
@@ -297,10 +310,23 @@ class _LaserCut(_Device):
         )
 
 
+class _Coil(_Device):
+    """Entry of a line of coils; the diameters of its sizes are those of the free loops."""
+
+    kind: Literal["coil"]
+    wound_diameter_um: _Stated[_Width_um]
+    stock_wire_um: _Stated[_Width_um]
+
+    def design(self) -> Design:
+        """Return the line of coils."""
+        wound_um, stock_um = self.wound_diameter_um.value, self.stock_wire_um.value
+        return Coil(wound_diameter_um=wound_um, stock_wire_um=stock_um, **self.shared())
+
+
 class _Catalogue(_Strict):
     """Content of a catalogue file."""
 
-    device: list[Annotated[_Braid | _Basket | _LaserCut, Field(discriminator="kind")]]
+    device: list[Annotated[_Braid | _Basket | _LaserCut | _Coil, Field(discriminator="kind")]]
 
 
 def parse(text: str, name: str = "The device catalogue") -> dict[str, Design]:

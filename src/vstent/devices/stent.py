@@ -148,6 +148,28 @@ class Stent:
 
 
 @dataclass(frozen=True, eq=False)
+class Coils(Stent):
+    """Coils in a sac, each one wire, the framing coil first; they have no contour."""
+
+    coils: tuple[Size, ...] = ()
+    """Size of every coil; its length is that which was pushed in."""
+    seed: int = 0
+    """Number from which the tips of the catheter and the turns of the framing coil are drawn."""
+    sac: Surface = field(default_factory=lambda: Surface(np.zeros((0, 3)), np.zeros((0, 3), np.int32)))
+    """Closed surface of the sac that they fill."""
+
+    @property
+    def volume_mm3(self) -> float:
+        """Volume of the coils, as round as they are wound."""
+        return float(np.pi / 4 * (self.wire_diameter_um[0] * MM_PER_UM) ** 2 * self.wire_length_mm)
+
+    @property
+    def density_fraction(self) -> float:
+        """Packing density: volume of the coils over that of the sac."""
+        return self.volume_mm3 / abs(self.sac.volume_mm3)
+
+
+@dataclass(frozen=True, eq=False)
 class Deployment:
     """Result of a deployment."""
 

@@ -28,11 +28,13 @@ SIDE_BY_SIDE: Final = "|"
 """Sign between implants of a treatment that lie side by side."""
 AS_IF_ALONE: Final = "&"
 """Sign between implants of a treatment that are deployed as if each were alone."""
+_DENSITY: Final = rf"\(\s*({_NUMBER})\s*%\s*(?:,\s*seed\s+(\d+)\s*)?\)"
+"""Form of the packing density of coils, with a seed."""
 IMPLANT: Final = re.compile(
-    rf"([\w-]+)(?:\s+({_NUMBER})\s*x\s*({_NUMBER}))?(?:\s*((?:(?<=\s)\w+\s*)?>\s*\w+))?"
+    rf"([\w-]+)(?:\s*{_DENSITY})?(?:\s+({_NUMBER})\s*x\s*({_NUMBER}))?(?:\s*((?:(?<=\s)\w+\s*)?>\s*\w+))?"
     rf"(?:\s*@\s*([+-]?{_NUMBER}|{FORK}))?"
 )
-"""Form of an implant in the text of a treatment: device, diameter x length in mm, > path, @ shift in mm or fork."""
+"""Form of an implant in the text of a treatment: device, density, diameter x length, > path, @ shift or fork."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,10 @@ class Implant:
     """Where it is placed."""
     inside: tuple[str, ...] = ()
     """Implants that are there before it, by id, in the order of their deployment; it opens inside them."""
+    density_fraction: float | None = None
+    """Packing density of coils; None: as proposed."""
+    seed: int = 0
+    """Number from which the random choices of coils are drawn."""
 
     def __post_init__(self) -> None:
         _check_name("implant", self.id)
@@ -159,7 +165,8 @@ def read_treatment(text: str) -> Treatment:
         ``> outlet_2`` from the inlet or ``outlet_1 > outlet_2`` from one arm of a fork to the other, and after ``@`` a
         shift of the proposed place in mm, positive distally, or ``fork``: it begins where its path has left the devices
         before it. Devices joined by ``|`` lie side by side; those joined by ``&`` are deployed as if each were alone.
-        ``NAME=`` before them names the treatment; otherwise its name is made of its devices and paths.
+        After coils may stand their packing density and a seed, ``coils(25%, seed 3)``. ``NAME=`` before them names the
+        treatment; otherwise its name is made of its devices and paths.
 
     Raises
     ------
@@ -179,7 +186,7 @@ def read_treatment(text: str) -> Treatment:
                 f"{part.strip()!r} is not an implant: write a device, its size, its path and its shift such as "
                 "'silk 4x20 > outlet_2 @-4'"
             )
-        device, diameter, length, path, shift = found.groups()
+        device, density, seed, diameter, length, path, shift = found.groups()
         device, path = device.lower(), re.sub(r"\s", "", path or "").removeprefix(ARM_TO_ARM)
         first = "_".join([device, *path.split(ARM_TO_ARM)]) if path else device
         ids = (first, *(f"{first}_{number}" for number in range(2, len(implants) + 2)))
@@ -195,6 +202,8 @@ def read_treatment(text: str) -> Treatment:
                     at_fork=shift == FORK,
                 ),
                 tuple(one.id for one in implants) if sign == NESTED else (),
+                float(density) / 100 if density else None,
+                int(seed or 0),
             )
         )
     if sign == SIDE_BY_SIDE:

@@ -23,12 +23,16 @@ PHASES = 20
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """A thin porous medium: the flow resistance of an implant on the surface that its wires span."""
+    """A porous medium: the flow resistance of an implant on the surface that its wires span, or in a region.
+
+    A region resists alike in all directions. It has the normal 0, and every sample stands for a volume: for so many mm2
+    of a sheet 1 mm thick.
+    """
 
     points_mm: Floats
     """(p, 3) sample points, dense on the surface."""
     normals: Floats
-    """(p, 3) unit normals of the surface."""
+    """(p, 3) unit normals of the surface, or 0 in a region."""
     area_mm2: Floats
     """(p,) surface area that each sample represents."""
     normal_resistance_Pa_s_m: Floats
@@ -36,7 +40,8 @@ class Sheet:
     tangential_resistance_Pa_s_m: Floats
     """(p,) shear stress per tangential velocity, Pa/(m/s)."""
     inertial_loss: Floats
-    """(p,) coefficient K of the pressure drop K rho |u| u_n / 2 and of the shear stress K rho |u| u_t / 4."""
+    """(p,) coefficient K of the pressure drop K rho |u| u_n / 2 and of the shear stress K rho |u| u_t / 4; in a region
+    of the pressure drop K rho |u| u / 4."""
     wire_diameter_mm: Floats
     """(p,) diameter of the wire at the sample."""
     spacing_mm: Floats

@@ -27,6 +27,10 @@ BLUNTED = 0.8
 """Ratio of the slowing by a band that drags least where the blood is slowest to the slowing by a uniform band. With
 this value, rows of wires 0.03 to 0.09 mm thick and 4 to 16 cells apart resist slow flow within 2 % of their drag law
 (`test_screen_sheet.py`)."""
+KOZENY = 6.5
+"""Kozeny constant c of coils: random fibres have 6 to 7 (Jackson and James 1986, Can. J. Chem. Eng. 64, 364)."""
+FORCHHEIMER = 0.1
+"""Coefficient of the inertial pressure gradient rho |u| u / sqrt(K) of coils; about 0.1 for beds of fibres."""
 GRID_MM = 0.15
 """Grid spacing, mm, at which `parted` judges whether wires are distinguished: between the default and that of a
 refined sac."""
@@ -40,6 +44,15 @@ def drag_per_length(diameter: Floats, spacing: Floats) -> Floats:
     """
     t = np.pi * np.minimum(diameter / spacing, 0.5) / 2
     return 8 * np.pi / (1 - 2 * np.log(2 * t) + 2 * t**2 / 3 - t**4 / 9)
+
+
+def permeability_mm2(density_fraction: Floats, diameter_mm: float) -> Floats:
+    """Return the permeability of coils by their local packing density 1 - e: K = e^3 / (c S^2), S = 4 (1 - e) / d.
+
+    S is the surface of the coils per volume, e the porosity, and c is `KOZENY`.
+    """
+    surface_per_mm = 4 * density_fraction / diameter_mm
+    return np.asarray((1 - density_fraction) ** 3 / (KOZENY * surface_per_mm**2), dtype=np.float64)
 
 
 def round_diameter(width: float, thickness: float) -> float:

@@ -96,6 +96,21 @@ def indices(
     return result | _of_sac_wall(field, sac, ostium)
 
 
+def between_coils(found: dict[str, float], porosity: float) -> dict[str, float]:
+    """Return the indices of a flow in which coils are a porous region, for the blood between them alone.
+
+    `porosity` is the blood's part of the sac: there is less of it, and it is faster than the velocity of the region,
+    which is the flow rate per area of blood and coils.
+    """
+    factors = {
+        "turnover_time_s": porosity,
+        "fast_sac_volume_mm3": porosity,
+        "mean_sac_velocity_m_s": 1 / porosity,
+        "sac_kinetic_energy_J": 1 / porosity,
+    }
+    return {name: value * factors.get(name, 1.0) for name, value in found.items()}
+
+
 def balance(case: FlowCase, field: FlowField) -> dict[str, float]:
     """Return shares, asked and reached, and mean pressures of several outlets, and the pressure that they share."""
     result = {"common_pressure_Pa": field.common_pressure_Pa} if case.resistances else {}

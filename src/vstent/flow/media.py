@@ -3,14 +3,16 @@
 import numpy as np
 
 from vstent.devices.design import LaserCut
-from vstent.devices.stent import Stent
+from vstent.devices.stent import Coils, Stent
 from vstent.flow.case import Sheet
 from vstent.flow.drag import (
     BREADTH,
+    FORCHHEIMER,
     crossing_factor,
     drag_per_length,
     inertial_loss,
     parted,
+    permeability_mm2,
     round_diameter,
     tangential_share,
 )
@@ -24,6 +26,12 @@ SMOOTHING_PORES = 1.5
 """Radius of the neighbourhood in which wire length per area is measured, in mean wire spacings."""
 SAMPLE_REACHES = 0.2
 """Maximum edge between the surface samples that measure the area of such a neighbourhood, in its radii."""
+REGION_MM = 0.15
+"""Spacing of the samples of a region of coils."""
+AROUND_COILS = 2.5
+"""Radius of the neighbourhood in which the density of coils is measured, in wound diameters."""
+SPARSEST_COILS, DENSEST_COILS = 0.005, 0.6
+"""Local densities below which coils do not resist, and above which they do as at this one."""
 PIECE_MM = 0.05
 """Maximum length of a piece of wire, mm."""
 ACROSS = 9
@@ -33,11 +41,15 @@ ACROSS = 9
 def media(stent: Stent, blood: Blood) -> tuple[Sheet, ...]:
     """Build the flow resistances of a deployed stent: one porous sheet, the screen model of its wires.
 
+    Those of coils are one porous region.
+
     Every piece of wire resists like a wire in a row with the local spacing, spread over a band around it. One law
     therefore covers braids, laser-cut cells and mixed wire diameters, also where bends have opened or closed the cells.
     The bands of a braid's wires merge into a sheet; those of laser-cut struts leave the cells between them open. The
     resistance is in proportion to the blood's viscosity.
     """
+    if isinstance(stent, Coils):
+        return (_region(stent, blood),)
     pieces = _pieces(stent)
     points_mm, along_mm, diameter_mm = pieces
     reach_mm = SMOOTHING_PORES * stent.spacing_mm
@@ -51,6 +63,32 @@ def media(stent: Stent, blood: Blood) -> tuple[Sheet, ...]:
     band_mm, area_mm2 = bands(points_mm, along_mm, normals, spacing_mm)
     columns = normals, area_mm2, normal_Pa_s_m, tangential_Pa_s_m, inertial_loss(solidity), diameter_mm, spacing_mm
     return (Sheet(band_mm.reshape(-1, 3), *(np.repeat(column, ACROSS, axis=0) for column in columns)),)
+
+
+def _region(coils: Coils, blood: Blood) -> Sheet:
+    """Build the flow resistance of coils: a porous region of their local density, alike in all directions.
+
+    The density at a point is the volume of coil over that of the sac around it. Coils have no preferred direction, and
+    a grid of usual spacing does not see single ones.
+    """
+    first_mm, last_mm, half_mm = coils.pieces_mm
+    wound_mm = 2 * float(half_mm[0])
+    low_mm, high_mm = coils.sac.vertices_mm.min(axis=0), coils.sac.vertices_mm.max(axis=0)
+    shape = np.ceil((high_mm - low_mm) / REGION_MM).astype(int) + 1
+    points_mm = low_mm + np.indices(shape).reshape(3, -1).T * REGION_MM
+    points_mm = points_mm[coils.sac.signed_distance(points_mm) < 0]
+    volume_mm3 = np.full((len(points_mm), 1), REGION_MM**3)
+    coil_mm3 = np.pi * half_mm**2 * curves.lengths(last_mm - first_mm)
+    reach_mm = AROUND_COILS * wound_mm
+    around_mm3 = nearby.sums(points_mm, points_mm, volume_mm3, reach_mm)[:, 0]
+    density = nearby.sums(points_mm, 0.5 * (first_mm + last_mm), coil_mm3[:, None], reach_mm)[:, 0] / around_mm3
+    is_filled = density > SPARSEST_COILS
+    permeability = permeability_mm2(np.minimum(density[is_filled], DENSEST_COILS), wound_mm)
+    resistance_Pa_s_m = blood.viscosity_Pa_s / (permeability * M_PER_MM)
+    loss, wound = 4 * FORCHHEIMER / np.sqrt(permeability), np.full(len(permeability), wound_mm)
+    where, still = points_mm[is_filled], np.zeros((len(permeability), 3))
+    volumes = volume_mm3[is_filled, 0]
+    return Sheet(where, still, volumes, resistance_Pa_s_m, resistance_Pa_s_m, loss, wound, wound)
 
 
 def bands(points_mm: Floats, along_mm: Floats, normals: Floats, spacing_mm: Floats) -> tuple[Floats, Floats]:

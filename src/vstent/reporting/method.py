@@ -14,7 +14,7 @@ import numpy as np
 from vstent.anatomy.landing_zones import neck_span_mm
 from vstent.anatomy.restore.paths import on_path
 from vstent.deployment.sketch import measured_wall, sketch
-from vstent.devices.design import Basket, Design, Size, widest_mm
+from vstent.devices.design import Basket, Coil, Design, Size, widest_mm
 from vstent.devices.stent import Deployment, Landing, Stent, tube_faces
 from vstent.devices.treatment import BARE
 from vstent.geometry.surface import Surface
@@ -77,7 +77,7 @@ def method_plates(
         found.append(_trimming(whole, scene))
     found += [_restoration(scene), _spheres(anatomy, scene)]
     implants = {
-        name: {key: one for key, one in deployed.items() if not isinstance(one.stent.design, Basket)}
+        name: {key: one for key, one in deployed.items() if not isinstance(one.stent.design, Basket | Coil)}
         for name, deployed in implants.items()
     }
     deployments = [(title, deployment) for _, _, title, deployment in titled(implants)]

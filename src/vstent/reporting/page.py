@@ -13,7 +13,7 @@ from markupsafe import Markup
 from numba import config
 
 from vstent.devices.design import Basket
-from vstent.devices.stent import Deployment
+from vstent.devices.stent import Coils, Deployment
 from vstent.devices.treatment import BARE
 from vstent.flow.ends import ASSUMED
 from vstent.flow.settings import LATTICE, OPENFOAM
@@ -256,6 +256,9 @@ def _implant(
     how = "terminated" if deployment.outcome == "terminated" else "stopped at its iteration limit"
     steps = counted(len(deployment.terminated_fraction), "iteration")
     words = f"The contour {how} after {steps}, in {deployment.seconds:.2f} s."
+    if isinstance(stent, Coils):
+        wires = f"{counted(len(stent.coils), 'coil')} of {diameters} µm"
+        words = f"Pushed in one after the other, in {deployment.seconds:.0f} s; seed {stent.seed}."
     if isinstance(stent.design, Basket):
         words = f"As many rows of crossings as outside, in {deployment.seconds:.2f} s."
     facts = [(Quantity((f.name,), None).name, f"{f.confidence}: {f.source}") for f in stent.design.facts]

@@ -8,8 +8,8 @@ import numpy as np
 
 from vstent.anatomy.landing_zones import ZONE_MM, neck_span_mm
 from vstent.anatomy.restore.paths import on_path
-from vstent.devices.design import Basket
-from vstent.devices.stent import Deployment, Stent
+from vstent.devices.design import Basket, Coil
+from vstent.devices.stent import Coils, Deployment, Stent
 from vstent.geometry.vessel import Anatomy
 from vstent.plan.criteria import default_criteria
 from vstent.plan.rank import Candidate, alternatives, graded_anew, landing_measures
@@ -118,6 +118,16 @@ def _picture(case: Planned, name: str) -> Picture:
 def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the table of device, landing zones and fit, with bands where there are any."""
     stent = deployment.stent
+    if isinstance(stent, Coils):
+        keys = {
+            "packing_density_fraction": "Packing density",
+            "coil_length_mm": "Length of all coils",
+            "coil_beyond_neck_mm": "Length beyond the plane of the neck",
+            "neck_covered_by_coils_fraction": "Part of the neck that they cover",
+        }
+        cells = [(words, format_value(key, metrics[key])) for key, words in keys.items()]
+        sizes = [(f"Coil {n}, loops x length", one.label) for n, one in enumerate(stent.coils, start=1)]
+        return [("Coils", stent.design.name), *cells, *sizes]
     if isinstance(stent.design, Basket):
         keys = {
             "basket_width_mm": "Width in the sac",
@@ -162,8 +172,8 @@ def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str,
 
 def _size_rows(case: Planned, stent: Stent, metrics: Mapping[str, Any]) -> Sequence[tuple[str, str, str]]:
     """Return the size of a device as it lies and its two best neighboring sizes, with their scores and reasons."""
-    if isinstance(stent.design, Basket):
-        return [("not ranked", "", "Sizes of baskets are not ranked.")]
+    if isinstance(stent.design, Basket | Coil):
+        return [("not ranked", "", "Sizes of devices in sacs are not ranked.")]
     anatomy = on_path(case.anatomy, stent.path)
     measures = {**metrics, **landing_measures(anatomy, dict(metrics))}
     own = graded_anew(Candidate(stent.design, stent.size, 0.0, measures, {}, 0.0, False, ""), default_criteria())

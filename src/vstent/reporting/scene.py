@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from vstent.anatomy.restore.paths import on_path
 from vstent.deployment.coverage import coverage_fractions
-from vstent.devices.stent import Deployment, Stent
+from vstent.devices.stent import Coils, Deployment, Stent
 from vstent.devices.treatment import BARE
 from vstent.flow.case import FlowField
 from vstent.flow.indices import on_sac
@@ -167,12 +167,11 @@ def scene_of(anatomy: Anatomy, implants: Implants, flows: Mapping[str, FlowField
     for name, deployment in deployments:
         stent = deployment.stent
         points, starts, _ = thin_lines(stent.wire_points_mm, stent.wire_starts, np.zeros(0), 60_000)
-        coverage = 100 * node_coverage(stent).ravel()
-        layers += [
-            contour_layer(name, deployment, anatomy),
-            LineLayer("wires", name, STEEL_COLOUR, points, starts, stent.wire_diameter_um / 2000),
-            MeshLayer("coverage", name, STEEL_COLOUR, stent.contour, scale="coverage", values=coverage),
-        ]
+        layers.append(LineLayer("wires", name, STEEL_COLOUR, points, starts, stent.wire_diameter_um / 2000))
+        if not isinstance(stent, Coils):
+            coverage = 100 * node_coverage(stent).ravel()
+            layers.append(contour_layer(name, deployment, anatomy))
+            layers.append(MeshLayer("coverage", name, STEEL_COLOUR, stent.contour, scale="coverage", values=coverage))
     for name, flow in flows.items():
         layers += flow_layers(name, flow, anatomy)
     return Scene(
@@ -190,7 +189,9 @@ def scene_of(anatomy: Anatomy, implants: Implants, flows: Mapping[str, FlowField
 
 def device_title(deployment: Deployment) -> str:
     """Return the name of a device with its size: ``Silk 4.0 × 20 mm``."""
-    size = deployment.stent.size
+    stent, size = deployment.stent, deployment.stent.size
+    if isinstance(stent, Coils):
+        return f"{stent.design.name} {stent.density_fraction:.0%}"
     return f"{deployment.stent.design.name} {size.diameter_mm:g} × {size.length_mm:g} mm"
 
 

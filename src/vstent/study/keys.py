@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from vstent.devices.catalogue import find_design
+from vstent.devices.design import Coil
 from vstent.devices.treatment import BARE, Implant, Treatment
 from vstent.flow.settings import LATTICE
 from vstent.io.files import existing
@@ -65,7 +66,8 @@ def implant_keys(anatomy: Key, treatment: Treatment) -> dict[str, Key]:
     keys: dict[str, Key] = {}
     for implant in treatment.implants:
         design = replace(find_design(implant.device), facts=(), ranges=())
-        given = design, implant.diameter_mm, implant.length_mm, implant.placing
+        given: tuple[Any, ...] = design, implant.diameter_mm, implant.length_mm, implant.placing
+        given += (implant.density_fraction, implant.seed) if isinstance(design, Coil) else ()
         inside = [keys[name] for name in implant.inside]
         keys[implant.id] = key_of("vstent.study.stages:deploy_implant", anatomy, *given, inside)
     return keys

@@ -105,7 +105,8 @@ def write_implant(folder: Path, deployment: Deployment) -> str:
     """Write contour, wires and struts of a deployed implant."""
     stent = deployment.stent
     folder.mkdir(parents=True, exist_ok=True)
-    writers.write_surface(folder / "contour.vtp", stent.contour, {"wall_gap_mm": deployment.wall_gap_mm.ravel()})
+    if len(stent.nodes_mm):  # coils have none
+        writers.write_surface(folder / "contour.vtp", stent.contour, {"wall_gap_mm": deployment.wall_gap_mm.ravel()})
     wire_id = np.arange(len(stent.wire_diameter_um), dtype=np.int32)
     of_wire: dict[str, NDArray[Any]] = {"wire_id": wire_id, "diameter_um": stent.wire_diameter_um}
     writers.write_lines(folder / "wires.vtp", stent.wire_points_mm, stent.wire_starts, cell_data=of_wire)

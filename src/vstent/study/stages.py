@@ -18,14 +18,15 @@ from vstent.anatomy.restore.paths import on_path
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
+from vstent.deployment.coils import deploy_coils
 from vstent.deployment.coverage import together
 from vstent.deployment.deploy import deploy, propose_landing, propose_size
 from vstent.deployment.forks import beyond_mm
 from vstent.deployment.measure import jailed_branches, measure
 from vstent.devices.catalogue import find_design, find_sizes
-from vstent.devices.design import Basket, Size
+from vstent.devices.design import Basket, Coil, Size
 from vstent.devices.ranges import how_sure
-from vstent.devices.stent import Deployment, Landing, Stent
+from vstent.devices.stent import Coils, Deployment, Landing, Stent
 from vstent.devices.treatment import BARE, Implant
 from vstent.errors import DeviceError, FlowError, InputError, LandingError, ReadError, VesselError, VstentError
 from vstent.flow.background import BackgroundWork
@@ -33,10 +34,10 @@ from vstent.flow.case import FlowField
 from vstent.flow.ends import ASSUMED
 from vstent.flow.engines import Progress as FlowProgress
 from vstent.flow.grade import computation_of, grade
-from vstent.flow.indices import balance, indices, ratios
+from vstent.flow.indices import balance, between_coils, indices, ratios
 from vstent.flow.ostium import sac_surfaces
 from vstent.flow.problem import flow_case, vessel_case
-from vstent.flow.settings import FlowSettings
+from vstent.flow.settings import OPENFOAM, FlowSettings
 from vstent.flow.simulation import foretell_cost, simulate_case
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.files import is_surface_file
@@ -204,10 +205,15 @@ def deploy_all(
 
 def deploy_implant(implant: Implant, anatomy: Anatomy, inside: Sequence[Stent] = ()) -> Deployment:
     """Deploy an implant in the given or proposed size and place, inside implants that are there in this order."""
-    anatomy = on_path(anatomy, implant.placing.path)
+    anatomy, design = on_path(anatomy, implant.placing.path), find_design(implant.device)
+    if isinstance(design, Coil):
+        if not implant.is_proposed:
+            raise LandingError(f"{design.name} have no size and place of their own: give a packing density instead.")
+        return deploy_coils(design, anatomy, implant.density_fraction, inside=inside, seed=implant.seed)
+    if implant.density_fraction is not None:
+        raise LandingError(f"{design.name} has no packing density: only coils have one.")
     size = size_of(implant, anatomy)
-    landing = landing_of(implant, anatomy, size, inside)
-    design, beside = find_design(implant.device), implant.placing.beside
+    landing, beside = landing_of(implant, anatomy, size, inside), implant.placing.beside
     return deploy(design, anatomy, size=size, landing=landing, inside=inside, beside=beside)
 
 
@@ -343,8 +349,8 @@ def vary_all(
         if len(deployed) != 1:
             continue
         (deployment,) = deployed.values()
-        if isinstance(deployment.stent.design, Basket):
-            store.progress(stage, 1.0, "left out: baskets are not varied.")
+        if isinstance(deployment.stent.design, Basket | Coil):
+            store.progress(stage, 1.0, "left out: devices in sacs are not varied.")
             continue
         varied = store.find(stage, keys[stage], Uncertainty)
         if varied is None:
@@ -378,7 +384,7 @@ def measure_study(
     if fields:
         case = flow_case(anatomy, (), settings.flow)
     for name, field in fields.items():
-        flow = indices(field, *shapes)
+        flow = between_coils(indices(field, *shapes), _porosity(implants.get(name, {}), settings.flow))
         judged = grade(case, field, flow)
         left = {"unsettled_fraction": field.unsettled_fraction} if isfinite(field.unsettled_fraction) else {}
         of_flow = case if name == BARE else case.resisted_as(fields[BARE])
@@ -395,7 +401,7 @@ def measure_study(
                 treatments[treatment.name]["implants"][implant.id],
                 implants[treatment.name][implant.id],
             )
-            if not isinstance(deployment.stent.design, Basket):
+            if not isinstance(deployment.stent.design, Basket | Coil):
                 measures["bands"] = bands_of(anatomy, deployment, measures, implant)
     for name, spread in varied.items():
         treatments[name]["uncertainty"] = spread
@@ -408,12 +414,19 @@ def measure_study(
 
 def measure_treatment(anatomy: Anatomy, deployed: Mapping[str, Deployment]) -> dict[str, Any]:
     """Return the metrics of deployed implants, each and together, and the openings of the branches that they jail."""
-    stents = [one.stent for one in deployed.values()]
+    stents = [one.stent for one in deployed.values() if not isinstance(one.stent, Coils)]
     found: dict[str, Any] = {
         "implants": {id_: measure(anatomy, one) for id_, one in deployed.items()},
         "jailed_branches": list(jailed_branches(anatomy, stents)),
     }
     return found | ({"together": together(anatomy, stents)} if len(stents) > 1 else {})
+
+
+def _porosity(deployed: Mapping[str, Deployment], flow: FlowSettings | None) -> float:
+    """Return blood's part of a sac in which coils are a porous region in the flow; 1 where there are none."""
+    if flow is None or flow.numerics.resolve_wires or flow.numerics.engine == OPENFOAM:
+        return 1.0
+    return 1.0 - sum(one.stent.density_fraction for one in deployed.values() if isinstance(one.stent, Coils))
 
 
 def neck_notes(metrics: Mapping[str, Any]) -> tuple[str, ...]:

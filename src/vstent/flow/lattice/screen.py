@@ -14,6 +14,9 @@ cell of each other are spread over the same layers, and the velocity along them 
 behind one: within 15 % for 60 Pa s/m each, and 40 % too low (both at the same place) to 60 % too high (half a cell
 apart) for 380. From two cells apart on each acts as alone (`tests/flow/test_screen_sheet.py`).
 
+A region, in which coils resist alike in all directions, has the normal 0. Where it shares a cell with a sheet, its
+inertial loss along the sheet's normal counts twice.
+
 Meshes of two implants closer than about a wire spacing lose more than the sum, because the wires of one narrow the gaps
 of the other. This is not modelled. In the drag law of a row (`vstent.flow.drag`) two like braids staggered in one
 plane, one braid of half the spacing, resist 1.9 times (d / s = 0.11) to 2.4 times (0.17) the sum of both alone. Meshes
@@ -153,6 +156,7 @@ def _combined(alone: Sequence[GridResistance]) -> GridResistance:
     size, axes = np.linalg.eigh(total(weight[:, None, None] * square))
     leads = size[:, 1] - size[:, 0] <= size[:, 2] - size[:, 1]
     axis = np.where(leads[:, None], axes[:, :, 2], axes[:, :, 0])
+    axis[size[:, 2] <= 0] = 0.0  # a region alone
     squared = np.einsum("ed,ed->e", axis[row], normal) ** 2
     along_axis = total(across + (along - across) * squared)
     across_axis = 0.5 * (total(along + 2 * across) - along_axis)

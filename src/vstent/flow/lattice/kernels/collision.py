@@ -228,10 +228,10 @@ def squared_reach(normal: Any) -> Any:
     """Return the squared distance along a unit normal over which links carry momentum across it: 1/2 to 1.
 
     It is the sum of w c_n^4 c_t^2 divided by that of w c_n^2 c_t^2, averaged over both tangents t, over the velocities
-    c of D3Q19.
+    c of D3Q19. It is 0 for the normal 0 of a region that resists alike in all directions.
     """
     x, y, z = normal[0] * normal[0], normal[1] * normal[1], normal[2] * normal[2]
-    return _THREE - _EIGHT * (x * x + y * y + z * z) + _SIX * (x * x * x + y * y * y + z * z * z)
+    return _THREE * (x + y + z) - _EIGHT * (x * x + y * y + z * z) + _SIX * (x * x * x + y * y * y + z * z * z)
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
@@ -273,6 +273,9 @@ def resist(normal: Any, entry: Any, u: Any, blood: Any) -> tuple[Any, Any]:
     sheet, whose tangential part is a fraction of that of v (`of_thin_sheet`). The tangential quadratic term is halved
     because wires that cross at right angles have half the drag along their plane. The equations are solved implicitly,
     so that there is no stability limit; |w| is found by two iterations from the linear resistances.
+
+    In a region without a thickness the normal is 0: it then resists all of the velocity, w = v, with the resistance
+    across and half of the quadratic term.
 
     `normal` (3) is the unit normal of the screen, and `blood` the result of `rates`. `entry` holds the linear
     resistances along the normal and across it and the quadratic one along it, per cell and time step, and the `spread`

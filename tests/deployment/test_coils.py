@@ -1,0 +1,180 @@
+"""Coils in sacs: distances by brute force over all pairs of segments, lengths, loops, zones and refusals."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from test_basket import ball
+
+from vstent.deployment.coils import bend_radii_mm, deploy_coils, measure_coils, next_size
+from vstent.deployment.deploy import deploy
+from vstent.deployment.struts import struts
+from vstent.devices.catalogue import find_design
+from vstent.devices.treatment import read_treatment
+from vstent.errors import LandingError
+from vstent.geometry.surface import Surface
+from vstent.kernels import rods
+from vstent.study.stages import deploy_implant
+
+COILS = find_design("coils")
+WOUND_MM = 0.305
+SAC = ball(2.5, 1.2)
+
+
+@cache
+def filled(density=0.25, seed=0):
+    return deploy_coils(COILS, SAC, density, seed=seed)
+
+
+def gaps_mm(coils):
+    """Smallest distance between the axes of all pairs of segments that are not within three segments of one coil."""
+    first, last, _ = coils.pieces_mm
+    wire = coils.point_wires[coils.piece_starts]
+    i, j = np.triu_indices(len(first), 1)
+    is_apart = (j - i > 3) | (wire[i] != wire[j])
+    i, j = i[is_apart], j[is_apart]
+    u, v, w = last[i] - first[i], last[j] - first[j], first[i] - first[j]
+    best = np.full(len(i), np.inf)
+    a, b, c, d, e = (np.einsum("pk,pk->p", x, y) for x, y in ((u, u), (u, v), (v, v), (u, w), (v, w)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inner = a * c - b * b
+        candidates = [((b * e - c * d) / inner, (a * e - b * d) / inner)]
+        candidates += [(np.full(len(i), s), (e + s * b) / c) for s in (0.0, 1.0)]
+        candidates += [((t * b - d) / a, np.full(len(i), t)) for t in (0.0, 1.0)]
+    for s, t in candidates:  # the inside, and the four edges of the square of both places
+        s, t = np.clip(np.nan_to_num(s), 0, 1), np.clip(np.nan_to_num(t), 0, 1)
+        best = np.minimum(best, np.linalg.norm(w + s[:, None] * u - t[:, None] * v, axis=1))
+    return best
+
+
+def test_no_coil_enters_another_or_the_wall_and_none_is_stretched_or_kinked():
+    coils = filled().stent
+    assert gaps_mm(coils).min() > WOUND_MM
+    assert SAC.aneurysms[0].sac.signed_distance(coils.wire_points_mm).max() < -0.5 * WOUND_MM + 0.01
+    first, last, _ = coils.pieces_mm
+    length_mm = np.linalg.norm(last - first, axis=1)
+    np.testing.assert_allclose(length_mm, WOUND_MM, rtol=0.01)
+    assert bend_radii_mm(coils.wire_points_mm, coils.wire_starts).min() > WOUND_MM
+
+
+def test_the_density_is_reached_in_balance_and_is_that_of_the_solids():
+    done = filled()
+    coils = done.stent
+    assert done.outcome == "terminated"
+    assert done.terminated_fraction[0] > 0.95
+    assert coils.density_fraction == pytest.approx(0.25, abs=0.01)
+    sac_mm3 = SAC.aneurysms[0].sac.volume_mm3
+    assert struts(coils).volume_mm3 / sac_mm3 == pytest.approx(coils.density_fraction, rel=0.01)
+    assert coils.wire_length_mm == pytest.approx(sum(one.length_mm for one in coils.coils), rel=0.01)
+
+
+def test_loops_keep_their_curl_where_the_sac_allows_and_the_framing_coil_lies_on_the_wall():
+    coils = filled(0.1, seed=2).stent
+    framing_mm = coils.wire_points_mm[: coils.wire_starts[1]]
+    radius_mm = np.median(bend_radii_mm(framing_mm, np.array([0, len(framing_mm)])))
+    assert radius_mm == pytest.approx(0.5 * coils.coils[0].diameter_mm, rel=0.3)
+    depth_mm = -SAC.aneurysms[0].sac.signed_distance(framing_mm)
+    points_mm = np.random.default_rng(0).uniform((-2.5, -2.5, -0.3), (2.5, 2.5, 4.7), (20_000, 3))
+    inside = -SAC.aneurysms[0].sac.signed_distance(points_mm)
+    is_rim = inside[inside > 0] < 0.8
+    assert (depth_mm < 0.8).mean() / is_rim.mean() > 1.3 * (depth_mm > 0.8).mean() / (~is_rim).mean()
+
+
+def test_seeds_repeat_a_result_to_the_last_bit_and_others_give_another():
+    again = deploy_coils("coils", SAC, 0.1, seed=2).stent
+    np.testing.assert_array_equal(again.wire_points_mm, filled(0.1, seed=2).stent.wire_points_mm)
+    other = deploy_coils("coils", SAC, 0.1, seed=3).stent
+    assert len(other.wire_points_mm) != len(again.wire_points_mm) or (
+        np.abs(other.wire_points_mm - again.wire_points_mm).max() > 0.1
+    )
+
+
+def test_zones_share_out_all_coil():
+    found = measure_coils(SAC, filled().stent)
+    assert 0.1 < found["neck_density_fraction"] < 0.4
+    assert found["packing_density_fraction"] == filled().stent.density_fraction
+    assert found["min_bend_radius_mm"] > WOUND_MM
+    assert 0 < found["neck_covered_by_coils_fraction"] < 1
+    assert found["coil_beyond_neck_mm"] < 1
+
+
+def test_coils_get_smaller_and_together_as_long_as_wanted():
+    sizes, left_mm = [], 1000.0
+    while size := next_size(COILS, 180.0, sizes, left_mm):
+        sizes.append(size)
+        left_mm -= size.length_mm
+    assert sizes[0].diameter_mm == 7.0  # a sphere of 180 mm3 is 7.005 mm wide
+    widths = [one.diameter_mm for one in sizes]
+    assert widths == sorted(widths, reverse=True)
+    assert abs(left_mm) <= 5
+
+
+def test_forces_are_the_slopes_of_the_energy():
+    draw, n, length = np.random.default_rng(0), 12, 0.3
+    x = np.cumsum(draw.normal(size=(n, 3)) * 0.1 + [0.25, 0, 0], axis=0)
+    frame = np.cross(np.diff(x, axis=0, append=x[-1:] + 1), draw.normal(size=(n, 3)))
+    frame /= np.linalg.norm(frame, axis=1, keepdims=True)
+    is_segment = np.ones(n, bool)
+    is_segment[[5, n - 1]] = False
+    laws = rods.Laws(length, 0.31, 100.0, 0.8, length / 0.39, 20.0)
+    here = rods.Rods(x, frame, 0.2 * draw.normal(size=(n, 2)), is_segment, np.zeros(n, bool))
+
+    def energy(shift, turn):
+        moved = rods.Rods(*[values.copy() for values in here])
+        rods._move(moved, 0, n, shift.ravel().copy(), turn, 1e9)
+        work = np.zeros((n, 3)), np.zeros(n), np.zeros((3 * n, rods.BAND)), np.zeros((n, 2))
+        return rods._bend(moved, laws, 0, n, *work), work
+
+    zero, still = np.zeros((n, 3)), np.zeros(n)
+    _, (force, torque, *_) = energy(zero, still)
+    for i in range(n):
+        turn = np.eye(n)[i] * 1e-6
+        assert torque[i] == pytest.approx((energy(zero, -turn)[0] - energy(zero, turn)[0]) / 2e-6, abs=1e-5)
+        for c in range(3):
+            shift = zero.copy()
+            shift[i, c] = 1e-6
+            slope = (energy(-shift, still)[0] - energy(shift, still)[0]) / 2e-6
+            assert force[i, c] == pytest.approx(slope, abs=1e-4)
+
+
+def test_the_band_matrix_is_solved():
+    draw, rows = np.random.default_rng(1), 30
+    matrix = draw.normal(size=(rows, rows)) * (np.abs(np.subtract.outer(range(rows), range(rows))) < rods.BAND)
+    matrix = matrix + matrix.T + 30 * np.eye(rows)
+    band = np.array([[matrix[i, i - k] if i >= k else 0.0 for k in range(rods.BAND)] for i in range(rows)])
+    right = draw.normal(size=rows)
+    solution = right.copy()
+    rods._solve(band, solution, 0, rows)
+    np.testing.assert_allclose(matrix @ solution, right, atol=1e-10)
+
+
+def test_treatments_state_density_and_seed():
+    one = read_treatment("enterprise + coils(22.5%, seed 3)")
+    assert one.name == "enterprise+coils"
+    assert one.implants[1].density_fraction == 0.225
+    assert one.implants[1].seed == 3
+    assert one.implants[1].inside == ("enterprise",)
+    assert read_treatment("coils").implants[0].density_fraction is None
+
+
+def test_what_does_not_fit_is_refused():
+    for text, words in (
+        ("coils(60%)", "up to 40%"),
+        ("coils 3x20", "give a packing density"),
+        ("silk(20%)", "no packing density"),
+    ):
+        with pytest.raises(LandingError, match=words):
+            deploy_implant(read_treatment(text).implants[0], SAC)
+    basket = deploy("web_sls", ball(3.5, 1.5)).stent
+    with pytest.raises(LandingError, match="do not share a sac"):
+        deploy_coils("coils", ball(3.5, 1.5), inside=[basket])
+    with pytest.raises(LandingError, match="come last"):
+        deploy("silk", SAC, inside=[filled(0.1, seed=2).stent])
+    with pytest.raises(LandingError, match="no line of coils"):
+        deploy_coils("silk", SAC)
+
+
+def test_solids_are_closed():
+    solid = struts(filled(0.1, seed=2).stent)
+    assert not solid.boundary_loops
+    assert isinstance(solid, Surface)
