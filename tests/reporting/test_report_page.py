@@ -301,3 +301,15 @@ def test_facts_on_a_device_are_named_without_the_unit_of_their_key(page):
 
 def test_headlines_are_defined():
     assert set(HEADLINES) <= set(DEFINITIONS)
+
+
+def test_ranked_treatments_have_a_table_and_their_reasons_and_are_no_other_numbers():
+    row = {"treatment": "silk <1>", "score": 0.5, "is_suitable": True, "reason": "Neck inflow & more."}
+    row |= {"neck_inflow_change_fraction": -0.31, "jailed_branches": {"outlet_2": -0.123}}
+    ranked = bare_case()
+    text = report(SimpleNamespace(**{**vars(ranked), "metrics": ranked.metrics | {"ranking": [row]}}))
+    for cell in ("silk &lt;1&gt;", "<td>50</td>", "<td>-31%</td>", "outlet_2 -12%", "Neck inflow &amp; more."):
+        assert cell in text
+    assert '<a href="#ranking">Treatments</a>' in text
+    assert "Other numbers" not in text
+    assert 'id="ranking"' not in report(ranked)

@@ -21,6 +21,7 @@ from vstent.plan.rank import Candidate, Ranking
 from vstent.reporting.definitions import INDICES_WITH_OCCLUSION
 from vstent.reporting.quality import qualities, unusable
 from vstent.reporting.quantities import ERRORS, flatten, format_change, format_value, opening_rows
+from vstent.reporting.ranked import HEAD, treatment_rows
 from vstent.reporting.uncertainty import ends, how_sure, intervals, number_name
 from vstent.study.progress import Progress
 
@@ -226,15 +227,6 @@ FLOW_COLUMNS: Final = (
 """Columns of a ranking by flow: title, key of the measure and number format."""
 
 
-TREATMENT_COLUMNS: Final = (
-    ("neck inflow", "neck_inflow_change_fraction", "{:+.0%}"),
-    ("sac velocity", "sac_velocity_change_fraction", "{:+.0%}"),
-    ("neck covered", "neck_coverage_fraction", "{:.0%}"),
-    ("metal in artery", "metal_in_artery_mm2", "{:.0f} mm²"),
-)
-"""Columns of a ranking of treatments: title, key of the measure and number format."""
-
-
 def ranking_table(ranking: Ranking, shown: int) -> Table:
     """Return the table of the best candidates of a ranking."""
     measured = {key for candidate in ranking.candidates for key in candidate.measures}
@@ -256,14 +248,11 @@ def ranking_table(ranking: Ranking, shown: int) -> Table:
     return table
 
 
-def treatments_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Return the table of ranked treatments, with the jailed branches by name and the change of their flow."""
-    table = Table("", "treatment", "score", *(title for title, _, _ in TREATMENT_COLUMNS), "jailed branches")
-    for number, row in enumerate(rows, start=1):
-        cells = ["" if row.get(key) is None else form.format(row[key]) for _, key, form in TREATMENT_COLUMNS]
-        jailed = ", ".join(f"{role} {change:+.0%}" for role, change in row["jailed_branches"].items())
-        score = f"{100 * row['score']:.0f}" if row["is_suitable"] else "out"
-        table.add_row(str(number), row["treatment"], score, *cells, jailed or "none")
+def treatments_table(ranked: Sequence[Mapping[str, Any]]) -> Table:
+    """Return the table of ranked treatments."""
+    table = Table(*HEAD)
+    for row in treatment_rows(ranked):
+        table.add_row(*row)
     table.caption = "Scores of 100; with jailed branches: the change of their flow."
     return table
 

@@ -23,6 +23,7 @@ from vstent.reporting.figures import Picture
 from vstent.reporting.packing import pack
 from vstent.reporting.quality import OF_GRADES, Quality, qualities, unusable
 from vstent.reporting.quantities import Change, Quantity, base_of, compare, flatten, opening_rows, unit_of
+from vstent.reporting.ranked import HEAD, treatment_rows
 from vstent.reporting.scene import Scene, titled, treatment_title
 from vstent.reporting.uncertainty import Varied, band_rows, how_sure, uncertainty_of
 from vstent.units import counted
@@ -45,7 +46,7 @@ AT_OUTLETS: Final = {
     "windkessel": "the Windkessel downstream of every outlet is assumed, unless a table states it",
 }
 """Limit that a report states, by the outlet setting of the flow."""
-SHOWN: Final = ("implants", "together", "flow", "change", "quality", "uncertainty")
+SHOWN: Final = ("implants", "together", "flow", "change", "quality", "uncertainty", "jailed_branches")
 """Metrics of a treatment that have a section of their own."""
 AT_INLETS: Final = "The flow through each inlet is assumed, not measured in the patient."
 """Limit that a report states where the vessel has several inlets."""
@@ -134,7 +135,7 @@ class Contents:
     @property
     def other(self) -> list[Quantity]:
         """Metrics that no other section shows."""
-        top = {key: value for key, value in self.metrics.items() if key not in ("vessel", "treatments")}
+        top = {key: value for key, value in self.metrics.items() if key not in ("vessel", "treatments", "ranking")}
         treatments = {
             name: {key: value for key, value in treatment.items() if key not in SHOWN}
             for name, treatment in self.metrics.get("treatments", {}).items()
@@ -220,6 +221,7 @@ def as_html(told: Contents) -> str:
         "anatomy": "Anatomy",
         "devices": "Devices" if told.implants else "",
         "flow": "Blood flow" if told.changes else "",
+        "ranking": "Treatments" if told.metrics.get("ranking") else "",
         "uncertainty": "Uncertainty" if told.uncertainty else "",
         "notes": "Notes and limits",
         "definitions": "Definitions",
@@ -232,6 +234,7 @@ def as_html(told: Contents) -> str:
         script_hashes=Markup(" ".join(f"'sha256-{digest}'" for digest in hashes)),
         style=Markup(asset("report.css") + asset("viewer.css")),
         scripts=[Markup(script) for script in scripts],
+        ranked=(HEAD, treatment_rows(told.metrics.get("ranking", ()))),
         of_grades=OF_GRADES,
         of_pulse=OF_PULSE,
         pictures=list(zip(told.pictures, images, strict=True)),

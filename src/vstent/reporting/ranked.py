@@ -1,0 +1,25 @@
+"""Ranked treatments as rows of text, for terminal and report."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+COLUMNS: Final = (
+    ("neck inflow", "neck_inflow_change_fraction", "{:+.0%}"),
+    ("sac velocity", "sac_velocity_change_fraction", "{:+.0%}"),
+    ("neck covered", "neck_coverage_fraction", "{:.0%}"),
+    ("metal in artery", "metal_in_artery_mm2", "{:.0f} mm²"),
+)
+"""Columns of measures: title, key and number format."""
+HEAD: Final = ("", "treatment", "score", *(title for title, _, _ in COLUMNS), "jailed branches")
+"""Titles of all columns."""
+
+
+def treatment_rows(ranked: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
+    """Return one row of `HEAD` for every treatment, with the jailed branches by name and the change of their flow."""
+    rows = []
+    for number, row in enumerate(ranked, start=1):
+        cells = ["" if row.get(key) is None else form.format(row[key]) for _, key, form in COLUMNS]
+        jailed = ", ".join(f"{role} {change:+.0%}" for role, change in row["jailed_branches"].items())
+        score = f"{100 * row['score']:.0f}" if row["is_suitable"] else "out"
+        rows.append((str(number), row["treatment"], score, *cells, jailed or "none"))
+    return rows
