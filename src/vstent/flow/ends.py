@@ -130,12 +130,12 @@ def ends_of(vessel: Vessel, settings: FlowSettings) -> tuple[End, ...]:
     inflow_mL_s, source = _inflow(inlets, settings)
     entering = [Inflow(mean_mL_s, source, settings.profile) for mean_mL_s in inflow_mL_s.tolist()]
     for word, given, usable in (
-        ("shares", settings.shares, ("split", *RESISTING)),
-        ("a table", settings.elements, RESISTING),
+        ("shares of the outlets", settings.shares, ("split", *RESISTING)),
+        ("resistances from a table", settings.elements, RESISTING),
     ):
         if given is not None and settings.outlets not in usable:
             choice = f"{', '.join(usable[:-1])} or {usable[-1]}"
-            raise InputError(f"{word} of the outlets have no effect with --outlets {settings.outlets}: choose {choice}")
+            raise InputError(f"{word} have no effect with --outlets {settings.outlets}: choose {choice}")
     if settings.outlets == "zero_pressure":
         return (*entering, *(Pressure() for _ in outlets))
     shares = murray_shares(outlets) if settings.outlets == "murray" else _shares(vessel, settings)

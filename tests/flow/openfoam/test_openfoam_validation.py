@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from womersley import MEAN_MEAN_M_S, PULSE, RADIUS_M, womersley_m_s
 
 from vstent import phantoms
 from vstent.anatomy.repair import repair
@@ -20,7 +21,7 @@ from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.engines import run
 from vstent.flow.indices import indices
 from vstent.flow.openfoam.engine import OpenFoam
-from vstent.flow.problem import flow_case
+from vstent.flow.problem import flow_case, vessel_case
 from vstent.flow.sampling import cells_inside
 from vstent.flow.settings import FlowSettings, Numerics
 from vstent.flow.simulation import simulate_case
@@ -96,3 +97,21 @@ def test_a_real_carotid(shared_data: Path, tmp_path: Path) -> None:
     lumen, _ = repair(read_surface(shared_data / "aneurisk_C0038.vtp")[0])
     case = restored(Vessel(lumen), 0.2)
     check(compared(case, tmp_path / "C0038", simulate_case(case)))
+
+
+def test_a_pulse_that_changes_its_profile_enters_as_womersleys(tmp_path: Path) -> None:
+    tube = trace(Vessel(phantoms.phantom_surface(phantoms.tube(length_mm=10.0, radius_mm=2.0))))
+    inflow_mL_s = MEAN_MEAN_M_S * np.pi * RADIUS_M**2 * 1e6
+    numerics = Numerics(max_cycles=2)
+    settings = FlowSettings(inflow_mL_s, profile="womersley", waveform=PULSE, numerics=numerics)
+    field = run(OpenFoam(0.35, tmp_path / "tube"), vessel_case(tube, settings))
+    r_mm, inlet = np.linspace(0, 1.7, 10), tube.inlet
+    peak_m_s = womersley_m_s(np.zeros(1), 0.0).max()
+    for phase in field.phases:
+        expected_m_s = womersley_m_s(1e-3 * r_mm, phase.time_s)
+        for after_mm in (1.0, 5.0):
+            points_mm = inlet.center_mm - after_mm * inlet.normal + r_mm[:, None] * [0.0, 1.0, 0.0]
+            found_m_s = -sampling.values_at(field.at_phase(phase), points_mm)[0] @ inlet.normal
+            np.testing.assert_allclose(found_m_s, expected_m_s, atol=0.02 * peak_m_s)
+        wanted_mL_s = inflow_mL_s * PULSE.factor(np.array([phase.time_s]))[0]
+        assert phase.inflow_mL_s == pytest.approx(wanted_mL_s, abs=0.002 * inflow_mL_s)
