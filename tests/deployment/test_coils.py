@@ -4,12 +4,14 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from test_basket import ball
 
 from vstent.deployment.coils import bend_radii_mm, deploy_coils, measure_coils, next_size
 from vstent.deployment.deploy import deploy
 from vstent.deployment.struts import struts
-from vstent.devices.catalogue import find_design
+from vstent.devices.catalogue import find_design, find_size
+from vstent.devices.stent import Landing
 from vstent.devices.treatment import read_treatment
 from vstent.errors import LandingError
 from vstent.geometry.surface import Surface
@@ -178,3 +180,16 @@ def test_solids_are_closed():
     solid = struts(filled(0.1, seed=2).stent)
     assert not solid.boundary_loops
     assert isinstance(solid, Surface)
+
+
+def test_coils_stay_outside_a_stent_whose_wires_none_crosses():
+    """The stent runs through the sac, lengthwise, so that coils have the room beside it."""
+    sac = ball(4.0, 3.0)
+    size = find_size(find_design("enterprise"), diameter_mm=4.5, length_mm=14)
+    stent = deploy("enterprise", sac, size=size, landing=Landing(8.0)).stent
+    coils = deploy_coils("coils", sac, 0.05, inside=[stent]).stent
+    assert stent.contour.closed.signed_distance(coils.wire_points_mm).min() > 0
+    (a, b, half), (p, q, thick) = coils.pieces_mm, stent.pieces_mm
+    fine = np.linspace(0, 1, 9)[:, None, None]
+    gap_mm = cKDTree((p + fine * (q - p)).reshape(-1, 3)).query((a + fine * (b - a)).reshape(-1, 3))[0].min()
+    assert gap_mm > half[0] + thick.max() - 0.01
