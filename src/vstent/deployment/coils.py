@@ -128,11 +128,14 @@ def deploy_coils(
     sac_mm3 = abs(aneurysm.sac.volume_mm3)
     total_mm = wanted * sac_mm3 / (np.pi / 4 * wound_mm**2)
     filling = _Filling(line, aneurysm, _room(aneurysm, inside, wound_mm), total_mm, np.random.default_rng(seed))
+    shortest = min(line.sizes, key=lambda size: (size.length_mm, size.diameter_mm))
     sizes: list[Size] = []
     is_full = False
     while not is_full:
         size = next_size(line, sac_mm3, sizes, total_mm - filling.length_mm)
         entered_mm = filling.push(size, is_framing=not sizes) if size else 0.0
+        if size and not entered_mm and size is not shortest:
+            size, entered_mm = shortest, filling.push(shortest, is_framing=not sizes)
         is_full = entered_mm == 0.0
         if size and entered_mm:
             is_whole = entered_mm > size.length_mm - filling.wound_mm

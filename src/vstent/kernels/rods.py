@@ -78,7 +78,7 @@ HARDENING: Final = 3e4
 def _weights(u: float, size: int, value: Any, slope: Any) -> int:
     """Write the weights of a quadratic B-spline at a grid coordinate and their slopes, (3,); return their first point.
 
-    Its gradient is continuous, so that a node comes to rest on a wall.
+    Its gradient is continuous, so that forces at a wall can balance.
     """
     i = min(max(int(u + 0.5), 1), size - 2)
     t = min(max(u - i, -0.5), 0.5)
