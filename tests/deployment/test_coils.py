@@ -4,12 +4,15 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
+from scipy.spatial import cKDTree
 from test_basket import ball
 
 from vstent.deployment.coils import bend_radii_mm, deploy_coils, measure_coils, next_size
 from vstent.deployment.deploy import deploy
 from vstent.deployment.struts import struts
-from vstent.devices.catalogue import find_design
+from vstent.devices.catalogue import find_design, find_size
+from vstent.devices.stent import Landing
 from vstent.devices.treatment import read_treatment
 from vstent.errors import LandingError
 from vstent.geometry.surface import Surface
@@ -178,3 +181,53 @@ def test_solids_are_closed():
     solid = struts(filled(0.1, seed=2).stent)
     assert not solid.boundary_loops
     assert isinstance(solid, Surface)
+
+
+def test_coils_stay_outside_a_stent_whose_wires_none_crosses():
+    """The stent runs through the sac, lengthwise, so that coils have the room beside it."""
+    sac = ball(4.0, 3.0)
+    size = find_size(find_design("enterprise"), diameter_mm=4.5, length_mm=14)
+    stent = deploy("enterprise", sac, size=size, landing=Landing(8.0)).stent
+    coils = deploy_coils("coils", sac, 0.05, inside=[stent]).stent
+    assert stent.contour.closed.signed_distance(coils.wire_points_mm).min() > 0
+    (a, b, half), (p, q, thick) = coils.pieces_mm, stent.pieces_mm
+    fine = np.linspace(0, 1, 9)[:, None, None]
+    gap_mm = cKDTree((p + fine * (q - p)).reshape(-1, 3)).query((a + fine * (b - a)).reshape(-1, 3))[0].min()
+    assert gap_mm > half[0] + thick.max() - 0.01
+
+
+def test_a_rod_that_is_flatter_than_its_sphere_lies_as_an_optimizer_lays_it():
+    """A rod with curl 1 / 6 in a sphere of 2.5 mm, against SLSQP over the angles of its segments in one plane."""
+    n, length, radius, natural = 18, 0.65, 2.5, 0.65 / 6
+    laws = rods.Laws(length, 0.4, 1e4, 1.2, 1.0, 200.0)
+    spacing, half = 0.1, 0.2
+    low = np.full(3, -3.2)
+    at = low[:, None, None, None] + spacing * np.indices((65, 65, 65))
+    room = (np.linalg.norm(at, axis=0) - radius, low, spacing)
+    turn = np.arange(n) * length / 1.7
+    x = 1.7 * np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+    x += 0.02 * np.random.default_rng(0).normal(size=x.shape)
+    along = np.diff(x, axis=0, append=2 * x[-1:] - x[-2:-1])
+    frame = np.cross([0.0, 0.0, 1.0], along)
+    frame /= np.linalg.norm(frame, axis=1, keepdims=True)
+    curl, is_segment = np.tile([natural, 0.0], (n, 1)), np.r_[np.ones(n - 1, bool), False]
+    state = rods.Rods(x, frame, curl, is_segment, np.zeros(n, bool))
+    for drag, steps in 4 * ((0.1, 300), (1.0, 300), (10.0, 200), (100.0, 100)):
+        rods.advance(state, laws, n, room, drag, steps, np.zeros(3), 0)
+    work = np.zeros((n, 3)), np.zeros(n), np.zeros((3 * n, rods.BAND)), np.zeros((n, 2))
+    found = rods._bend(state, laws, 0, n, *work)
+
+    def nodes(angles):
+        steps = length * np.stack([np.cos(angles[2:]), np.sin(angles[2:])], axis=1)
+        return angles[:2] + np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+
+    def energy(angles):
+        return 0.5 / length * ((2 * np.tan(0.5 * np.diff(angles[2:])) - natural) ** 2).sum()
+
+    guess = np.r_[1.7, 0.0, np.pi / 2 + (np.arange(n - 1) + 0.5) * length / 1.7]
+    inside = {"type": "ineq", "fun": lambda angles: (radius - half) ** 2 - (nodes(angles) ** 2).sum(axis=1)}
+    best = minimize(energy, guess, constraints=[inside], method="SLSQP", options={"maxiter": 500, "ftol": 1e-10})
+    assert best.success
+    assert found == pytest.approx(best.fun, rel=0.02)
+    from_middle = np.linalg.norm(state.x, axis=1)
+    np.testing.assert_allclose(from_middle, np.linalg.norm(nodes(best.x), axis=1), atol=0.1 * laws.diameter)

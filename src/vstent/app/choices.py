@@ -7,7 +7,7 @@ from typing import Annotated, Any, Final, Self, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model, field_validator, model_validator
 
 from vstent.devices.catalogue import find_design
-from vstent.devices.design import Basket
+from vstent.devices.design import Basket, Coil
 from vstent.devices.treatment import Treatment
 from vstent.fields import POSITION, Option, check_all
 from vstent.flow.measured import MeasuredProfile
@@ -159,9 +159,9 @@ class Choices(OfVessel):
 
     @property
     def ranked(self) -> list[str]:
-        """Keys of the chosen devices whose sizes are ranked: all but baskets."""
+        """Keys of the chosen devices whose sizes are ranked: all but baskets and coils."""
         chosen = sorted({device for treatment in self.treatments for device in treatment.devices})
-        return [device for device in chosen if not isinstance(find_design(device), Basket)]
+        return [device for device in chosen if not isinstance(find_design(device), Basket | Coil)]
 
     def settings(self, former: Settings) -> Settings:
         """Return the settings of the study; settings that the page cannot change are taken from `former`."""

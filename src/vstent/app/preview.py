@@ -31,9 +31,9 @@ from vstent.deployment.measure import measure
 from vstent.deployment.method import laid_inside
 from vstent.deployment.sketch import MeasuredWall, Sketch, measured_wall, sketch
 from vstent.devices.catalogue import find_design
-from vstent.devices.design import Basket
+from vstent.devices.design import Basket, Coil
 from vstent.devices.formulas import coverage_fraction, free_diameters_mm
-from vstent.devices.stent import Deployment, Landing, Stent
+from vstent.devices.stent import Coils, Deployment, Landing, Stent
 from vstent.devices.treatment import BARE, Implant, Placing, Treatment, with_device
 from vstent.errors import DeviceError, InputError, ReadError, VstentError
 from vstent.flow.case import FlowField
@@ -189,7 +189,7 @@ class Preview:
 
         def compute() -> dict[str, Any]:
             measures, deployment = self._measures(treatment, implant), self.deployment(treatment, implant)
-            if isinstance(deployment.stent.design, Basket):
+            if isinstance(deployment.stent.design, Basket | Coil):
                 return measures
             return measures | {"bands": bands_of(self.anatomy, deployment, measures, implant)}
 
@@ -207,16 +207,18 @@ class Preview:
 
     def _drawn(self, pane: str, treatment: Treatment, colour: Colour) -> list[MeshLayer | LineLayer]:
         """Return wires and contours of a deployed treatment in a pane."""
-        contours = [contour_layer(pane, one, self.anatomy) for one in self.deployed(treatment).values()]
+        meshes = [one for one in self.deployed(treatment).values() if not isinstance(one.stent, Coils)]
+        contours = [contour_layer(pane, one, self.anatomy) for one in meshes]
         return [*self._wires(pane, treatment, colour), *contours]
 
     def _sheets(self, treatment: Treatment) -> list[dict[str, Any]]:
         """Return the tables of the deployed implants of a treatment."""
         titles = implant_titles(self.deployed(treatment))
         found = [sheets.device(titles[one.id], self._measures(treatment, one)) for one in treatment.implants]
-        if len(found) > 1:
+        stents = [one for one in self.stents(treatment) if not isinstance(one, Coils)]
+        if len(stents) > 1:
             key = "together", self.case.state.anatomy, treatment.implants
-            measures = self._cached(key, lambda: together(self.anatomy, self.stents(treatment)))
+            measures = self._cached(key, lambda: together(self.anatomy, stents))
             found.append(sheets.device("All devices together", measures))
         return found
 
@@ -224,8 +226,8 @@ class Preview:
         """Return the bands of a deployed implant as the page shows them; those of gaps take some seconds."""
         chosen = _implant(treatment, implant)
         told: dict[str, Any] = {"treatment": treatment.name, "implant": implant}
-        if isinstance(find_design(chosen.device), Basket):
-            return told | {"sentence": "No ranges are computed for baskets.", "rows": []}
+        if isinstance(find_design(chosen.device), Basket | Coil):
+            return told | {"sentence": "No ranges are computed for devices in sacs.", "rows": []}
         with LOCK:
             metrics = self._metrics(treatment, chosen)
             anatomy, deployment = self.anatomy, self.deployment(treatment, chosen)
@@ -280,6 +282,8 @@ class Preview:
 
         A path other than the parent artery comes with it.
         """
+        if isinstance(stent, Coils):
+            return {"device": stent.design.key, "size": stent.size.label, "is_coils": True}
         ends = (stent.proximal_abscissa_mm, stent.distal_abscissa_mm)
         told = {
             "device": stent.design.key,
@@ -570,6 +574,9 @@ def _disc(number: int, opening: Opening) -> MeshLayer:
 
 def _wires(name: str, stent: Stent, gap_mm: Floats, colour: Colour, coverage: Callable[[], Floats]) -> LineLayer:
     """Return the wires of a device, colored by the values at the nearest nodes (rows, columns)."""
+    if isinstance(stent, Coils):
+        half_mm = stent.wire_diameter_um / 2000
+        return LineLayer("wires", name, STEEL_COLOUR, stent.wire_points_mm, stent.wire_starts, half_mm)
     of_node = gap_mm
     if colour == "coverage":
         of_node = 100 * coverage()
@@ -603,7 +610,7 @@ def _seen(found: Sketch | Deployment) -> tuple[Stent, Floats]:
 
 def _is_sketched(treatment: Treatment, implant: Implant) -> bool:
     """Return whether an implant has a preview: it is a stent whose artery no implant on another path narrows."""
-    if isinstance(find_design(implant.device), Basket) or implant.placing.beside:
+    if isinstance(find_design(implant.device), Basket | Coil) or implant.placing.beside:
         return False
     return all(_implant(treatment, name).placing.path == implant.placing.path for name in implant.inside)
 
@@ -628,6 +635,6 @@ def _section(surface: Surface, center: Floats, frame: Floats) -> list[float]:
 
 def _row_at(stent: Stent, at_mm: float) -> int | None:
     """Return the row of a device nearest to a plane across the parent axis; None where it is not there."""
-    is_there = stent.path == PARENT and not isinstance(stent.design, Basket)
+    is_there = stent.path == PARENT and not isinstance(stent.design, Basket | Coil)
     is_there = is_there and stent.proximal_abscissa_mm <= at_mm <= stent.distal_abscissa_mm
     return int(np.argmin(np.abs(stent.row_abscissa_mm - at_mm))) if is_there else None

@@ -361,6 +361,7 @@ def devices() -> list[dict[str, Any]]:
             "n_facts": len(design.facts),
         }
         for key, design in (catalogue() | baskets()).items()
+        if design.use != "coils"  # which are given by their density, in the text of a treatment
     ]
 
 

@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -127,11 +128,14 @@ def deploy_coils(
     sac_mm3 = abs(aneurysm.sac.volume_mm3)
     total_mm = wanted * sac_mm3 / (np.pi / 4 * wound_mm**2)
     filling = _Filling(line, aneurysm, _room(aneurysm, inside, wound_mm), total_mm, np.random.default_rng(seed))
+    shortest = min(line.sizes, key=lambda size: (size.length_mm, size.diameter_mm))
     sizes: list[Size] = []
     is_full = False
     while not is_full:
         size = next_size(line, sac_mm3, sizes, total_mm - filling.length_mm)
         entered_mm = filling.push(size, is_framing=not sizes) if size else 0.0
+        if size and not entered_mm and size is not shortest:
+            size, entered_mm = shortest, filling.push(shortest, is_framing=not sizes)
         is_full = entered_mm == 0.0
         if size and entered_mm:
             is_whole = entered_mm > size.length_mm - filling.wound_mm
@@ -323,7 +327,11 @@ def _room(aneurysm: Aneurysm, inside: Sequence[Stent], wound_mm: float) -> Room:
     for stent in inside:
         is_inner = distance_mm < wound_mm
         wire_mm = 0.5 * float(stent.wire_diameter_um.max()) * MM_PER_UM
-        to_stent_mm = stent.contour.closed.signed_distance(room.points_mm(is_inner))
+        points_mm = room.points_mm(is_inner)
+        to_wires_mm = cKDTree(np.concatenate(list(_finely(stent, wire_mm)))).query(points_mm)[
+            0
+        ]  # drawn off the contour
+        to_stent_mm = np.minimum(stent.contour.closed.signed_distance(points_mm), to_wires_mm)
         distance_mm[is_inner] = np.maximum(distance_mm[is_inner], wire_mm - to_stent_mm)
     return room._replace(distance_mm=distance_mm)
 
@@ -389,10 +397,10 @@ def _covered(aneurysm: Aneurysm, coils: Coils) -> float:
     return float(np.average(is_covered.mean(axis=1), weights=area_mm2))
 
 
-def _finely(coils: Coils, step_mm: float) -> Iterator[Floats]:
-    """Yield points (n, 3) along every coil at most a step apart."""
-    for first, last in zip(coils.wire_starts[:-1], coils.wire_starts[1:], strict=True):
-        yield curves.resample(coils.wire_points_mm[first:last], step_mm)
+def _finely(stent: Stent, step_mm: float) -> Iterator[Floats]:
+    """Yield points (n, 3) along every wire or coil about a step apart."""
+    for first, last in pairwise(stent.wire_starts):
+        yield curves.resample(stent.wire_points_mm[first:last], step_mm)
 
 
 def _advise(coils: Coils, wanted: float, imbalance: float) -> str:

@@ -27,10 +27,13 @@ BLUNTED = 0.8
 """Ratio of the slowing by a band that drags least where the blood is slowest to the slowing by a uniform band. With
 this value, rows of wires 0.03 to 0.09 mm thick and 4 to 16 cells apart resist slow flow within 2 % of their drag law
 (`test_screen_sheet.py`)."""
-KOZENY = 6.5
-"""Kozeny constant c of coils: random fibres have 6 to 7 (Jackson and James 1986, Can. J. Chem. Eng. 64, 364)."""
-FORCHHEIMER = 0.1
-"""Coefficient of the inertial pressure gradient rho |u| u / sqrt(K) of coils; about 0.1 for beds of fibres."""
+KOZENY = 4.09, 0.72
+"""Kozeny constant c = a + b / density of coils: 6.4 at 31 % and 9.0 at 15 %, within 1 % of resolved wires along three
+axes (`benchmarks/meshes.py`, `meshes.json`). Random fibres have 6 to 7 (Jackson and James 1986, Can. J. Chem. Eng. 64,
+364)."""
+COIL_INERTIA = 0.024
+"""Increase of the resistance of coils per Reynolds number of their diameter and the superficial speed: resolved wires
+resist 1.23 to 1.26 times as much at 10 as in creeping flow, at 15 to 31 % (`benchmarks/meshes.py`, `meshes.json`)."""
 GRID_MM = 0.15
 """Grid spacing, mm, at which `parted` judges whether wires are distinguished: between the default and that of a
 refined sac."""
@@ -49,10 +52,10 @@ def drag_per_length(diameter: Floats, spacing: Floats) -> Floats:
 def permeability_mm2(density_fraction: Floats, diameter_mm: float) -> Floats:
     """Return the permeability of coils by their local packing density 1 - e: K = e^3 / (c S^2), S = 4 (1 - e) / d.
 
-    S is the surface of the coils per volume, e the porosity, and c is `KOZENY`.
+    S is the surface of the coils per volume, e the porosity, and c follows from `KOZENY`.
     """
-    surface_per_mm = 4 * density_fraction / diameter_mm
-    return np.asarray((1 - density_fraction) ** 3 / (KOZENY * surface_per_mm**2), dtype=np.float64)
+    surface_per_mm, constant = 4 * density_fraction / diameter_mm, KOZENY[0] + KOZENY[1] / density_fraction
+    return np.asarray((1 - density_fraction) ** 3 / (constant * surface_per_mm**2), dtype=np.float64)
 
 
 def round_diameter(width: float, thickness: float) -> float:

@@ -7,7 +7,7 @@ from vstent.devices.stent import Coils, Stent
 from vstent.flow.case import Sheet
 from vstent.flow.drag import (
     BREADTH,
-    FORCHHEIMER,
+    COIL_INERTIA,
     crossing_factor,
     drag_per_length,
     inertial_loss,
@@ -85,7 +85,7 @@ def _region(coils: Coils, blood: Blood) -> Sheet:
     is_filled = density > SPARSEST_COILS
     permeability = permeability_mm2(np.minimum(density[is_filled], DENSEST_COILS), wound_mm)
     resistance_Pa_s_m = blood.viscosity_Pa_s / (permeability * M_PER_MM)
-    loss, wound = 4 * FORCHHEIMER / np.sqrt(permeability), np.full(len(permeability), wound_mm)
+    loss, wound = 4 * COIL_INERTIA * wound_mm / permeability, np.full(len(permeability), wound_mm)
     where, still = points_mm[is_filled], np.zeros((len(permeability), 3))
     volumes = volume_mm3[is_filled, 0]
     return Sheet(where, still, volumes, resistance_Pa_s_m, resistance_Pa_s_m, loss, wound, wound)

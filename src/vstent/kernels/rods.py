@@ -78,13 +78,22 @@ HARDENING: Final = 3e4
 def _weights(u: float, size: int, value: Any, slope: Any) -> int:
     """Write the weights of a quadratic B-spline at a grid coordinate and their slopes, (3,); return their first point.
 
-    Its gradient is continuous, so that a node comes to rest on a wall.
+    Its gradient is continuous, so that forces at a wall can balance.
     """
     i = min(max(int(u + 0.5), 1), size - 2)
     t = min(max(u - i, -0.5), 0.5)
     value[0], value[1], value[2] = 0.5 * (0.5 - t) ** 2, 0.75 - t * t, 0.5 * (0.5 + t) ** 2
     slope[0], slope[1], slope[2] = t - 0.5, -2 * t, t + 0.5
     return i - 1
+
+
+@njit(cache=True, error_model="numpy")
+def _nearest(field: Any, low: Any, spacing: float, p: Any) -> float:
+    """Return the value of a field (i, j, k) at the point of its grid that is nearest to a point (3,)."""
+    i = min(max(int((p[0] - low[0]) / spacing + 0.5), 0), field.shape[0] - 1)
+    j = min(max(int((p[1] - low[1]) / spacing + 0.5), 0), field.shape[1] - 1)
+    k = min(max(int((p[2] - low[2]) / spacing + 0.5), 0), field.shape[2] - 1)
+    return field[i, j, k]
 
 
 @njit(cache=True, error_model="numpy")
@@ -329,17 +338,28 @@ def _press(
 def _contain(rods: Any, laws: Any, first: int, n: int, room: Any, force: Any, matrix: Any) -> float:
     """Add forces and stiffness of the contact with the wall; return the energy."""
     field, low, spacing = room
-    d, spline, energy = np.zeros(3), np.zeros((6, 3)), 0.0
-    for i in range(first, n):
-        if rods.is_held[i]:
+    x, p, d, spline, energy = rods.x, np.zeros(3), np.zeros(3), np.zeros((6, 3)), 0.0
+    clear = -0.5 * laws.diameter - 2 * spacing
+    for k in range(2 * first, 2 * n):
+        i, t = k // 2, 0.5 * (k % 2)  # nodes and middles of segments, which are nearer to an edge
+        if rods.is_held[i] or (t > 0.0 and (i == n - 1 or not rods.is_segment[i] or rods.is_held[i + 1])):
             continue
-        deep = _distance_at(field, low, spacing, rods.x[i], spline, d) + 0.5 * laws.diameter
+        for c in range(3):
+            p[c] = x[i, c] + t * (x[i + 1, c] - x[i, c]) if t > 0.0 else x[i, c]
+        if _nearest(field, low, spacing, p) < clear:
+            continue
+        deep = _distance_at(field, low, spacing, p, spline, d) + 0.5 * laws.diameter
         if deep > 0.0:
             push, slope, stored = _pushed(deep, laws)
             energy += stored
             for c in range(3):
-                force[i, c] -= push * d[c]
-            _add_block(matrix, i, i, slope, d)
+                force[i, c] -= (1 - t) * push * d[c]
+            _add_block(matrix, i, i, (1 - t) * (1 - t) * slope, d)
+            if t > 0.0:
+                for c in range(3):
+                    force[i + 1, c] -= t * push * d[c]
+                _add_block(matrix, i + 1, i + 1, t * t * slope, d)
+                _add_block(matrix, i + 1, i, t * (1 - t) * slope, d)
     return energy
 
 

@@ -12,7 +12,7 @@ from vstent.anatomy.morphology import Measures
 from vstent.deployment.deploy import deploy, propose_landing
 from vstent.deployment.measure import measure
 from vstent.deployment.sizing import propose_size
-from vstent.devices.design import Basket, Design, Size
+from vstent.devices.design import Basket, Coil, Design, Size
 from vstent.devices.stent import Landing
 from vstent.errors import InputError, LandingError
 from vstent.geometry.vessel import Anatomy
@@ -139,11 +139,11 @@ def rank(
     Raises
     ------
     InputError
-        There is no device or no shift to try, or a device is a basket.
+        There is no device or no shift to try, or a device lies in a sac.
     """
     criteria = criteria or default_criteria()
     for design in designs:
-        if isinstance(design, Basket):
+        if isinstance(design, Basket | Coil):
             raise InputError(f"{design.name} lies in a sac, and the ranking is of devices for arteries: leave it out.")
     proposed = set()
     for design in designs:

@@ -140,8 +140,10 @@ def plates(scene: Scene) -> list[Plate]:
             for shot in wire_shots(scene, pane)
         ]
         ids = ("lumen", "continued", "coverage", "neck")
-        drawn.append(_contours(scene))
-        drawn.append(by_value("coverage", ids, "Metal coverage of the wall", coverage, devices))
+        meshes = [(pane, title) for pane, title in devices if scene.pick(("contour",), pane)]  # coils have none
+        if meshes:
+            drawn.append(_contours(scene, meshes))
+            drawn.append(by_value("coverage", ids, "Metal coverage of the wall", coverage, meshes))
         drawn.append(Plate("wires", "Wires across the neck", wires, scene, shots))
     present = {layer.id for layer in scene.layers}
     return drawn + [by_value(*row) for row in _OF_FLOW if row[0] in present]
@@ -240,10 +242,10 @@ def _colours(layer: MeshLayer | LineLayer, scene: Scene, depth_mm: Floats) -> Fl
     return colours * (1 - pale) + np.array(BACKGROUND) * pale
 
 
-def _contours(scene: Scene) -> Plate:
-    """Return the picture of the deployed contours, colored by their gap to the wall."""
+def _contours(scene: Scene, meshes: Sequence[tuple[str, str]]) -> Plate:
+    """Return the picture of the deployed contours in these panes, colored by their gap to the wall."""
     shots = []
-    for pane, title in scene.panes[1:]:
+    for pane, title in meshes:
         contour = next(layer for layer in scene.pick(("contour",), pane) if isinstance(layer, MeshLayer))
         largest_mm = float(contour.values.max())
         profile, is_seen = scene.view("profile"), largest_mm >= SEEN_GAP_MM
