@@ -82,9 +82,9 @@ def test_of_a_treatment_with_two_implants_both_are_shown_and_each_is_moved(arter
     command = ["run", str(artery), "--out", str(study), "--units", "mm", "--treatment", "silk + silk@-4", "--no-flow"]
     assert main(command) == 0
     with app_case.served(tmp_path / "cases", study) as client, browsing(client) as page:
-        step(page, "Device")
-        box = page.locator("label.device", has_text="1. Silk, 2. Silk")
-        playwright.expect(box.locator("input")).to_be_checked()
+        step(page, "Treatment")
+        playwright.expect(page.locator("label.device", has_text="Silk + Silk").locator("input")).to_be_checked()
+        playwright.expect(page.locator(".implant > span")).to_have_text(["1. Silk proposed", "2. Silk proposed"])
         step(page, "Deploy")
         playwright.expect(page.locator(".sheet.columns-2 .row.head b")).to_have_text(
             ["1. Silk 4 × 15 mm", "2. Silk 4 × 15 mm"]
@@ -103,6 +103,64 @@ def test_of_a_treatment_with_two_implants_both_are_shown_and_each_is_moved(arter
         assert in_time(page, lambda: place_of(page, "distal") == outer)
         playwright.expect(page.locator(".section-words")).to_contain_text("Free device")
         assert page.locator(".section .cut.device").count() == 2
+
+
+@pytest.mark.system
+def test_a_treatment_is_built_reordered_and_taken_apart_by_keys(artery, tmp_path):
+    with app_case.served(tmp_path / "cases") as client, browsing(client, 1024, 768) as page:
+        drop(page, artery)
+        page.wait_for_selector(".step.done:nth-child(3)")
+        step(page, "Treatment")
+        headings = page.locator(".catalogue h3")
+        playwright.expect(headings).to_have_text(["Flow diverters", "Stents for coils", "Baskets for the sac"])
+        playwright.expect(page.locator(".chosen b")).to_have_text(["Silk", "Enterprise"])
+        page.get_by_label("Add a device inside Silk").focus()
+        page.keyboard.type("enter")  # the first stent whose name begins so
+        page.keyboard.press("Enter")
+        implants = page.locator(".implant > span")
+        playwright.expect(implants).to_have_text(["1. Silk proposed", "2. Enterprise proposed"])
+        later = page.get_by_role("button", name="Deploy later: 1. Silk")
+        later.focus()
+        page.keyboard.press("Enter")
+        playwright.expect(implants).to_have_text(["1. Enterprise proposed", "2. Silk proposed"])
+        treatments = client.get("/api/cases/phantom").json()["choices"]["treatments"]
+        assert [one["name"] for one in treatments] == ["enterprise+silk", "enterprise"]
+        assert [one["inside"] for one in treatments[0]["implants"]] == [[], ["enterprise"]]
+        page.get_by_role("button", name="Remove 2. Silk").click()
+        playwright.expect(page.locator(".toast")).to_have_text("Enterprise is already in the list.")
+        page.get_by_role("button", name="Remove 1. Enterprise").click()
+        playwright.expect(page.locator(".chosen b")).to_have_text(["Silk", "Enterprise"])
+        page.get_by_label("Search devices").press_sequentially("baskets")
+        playwright.expect(page.locator(".catalogue")).to_have_text("No device has this in its name, maker or use.")
+        page.get_by_label("Search devices").press("Backspace")
+        playwright.expect(headings).to_have_text(["Baskets for the sac"])
+        assert page.evaluate("document.documentElement.scrollWidth") <= 1024
+
+
+@pytest.mark.system
+def test_a_basket_is_chosen_pulled_out_of_the_sac_and_followed_by_the_blood(artery, tmp_path):
+    with app_case.served(tmp_path / "cases") as client, browsing(client) as page:
+        drop(page, artery)
+        page.wait_for_selector(".step.done:nth-child(3)")
+        view = client.get("/api/cases/phantom").json()
+        choices = view["choices"] | {"treatments": [], "flow": view["choices"]["flow"] | {"cell_size_mm": 0.4}}
+        client.put("/api/cases/phantom/choices", json={"revision": view["revision"], "choices": choices})
+        step(page, "Treatment")
+        page.locator("[data-key=device-web_sl]").check()
+        playwright.expect(page.locator(".panel .hint")).to_have_text("Sizes of baskets are not ranked.")
+        step(page, "Deploy")
+        word = page.locator(".handle.proximal .handle-word")
+        playwright.expect(word).to_have_text("0.0 mm above neck", timeout=120 * SECOND)
+        playwright.expect(page.locator(".handle.distal")).to_be_hidden()
+        playwright.expect(page.locator(".sheet .term").first).to_have_text("Basket width")
+        drag(page, ".handle.proximal .knob", 0, 40)
+        playwright.expect(word).to_contain_text("below neck")
+        page.wait_for_selector(".place .row:has-text('below neck')")
+        assert in_time(page, lambda: chosen(client)["treatments"][0]["implants"][0]["placing"]["shift_mm"] < -0.3)
+        page.locator("#live-flow").check()
+        assert in_time(page, lambda: page.locator(".live-cards b").count() and inflow_percent(page) < -30, 240)
+        page.get_by_role("button", name="Put it on the neck again").click()
+        playwright.expect(word).to_have_text("0.0 mm above neck")
 
 
 @pytest.mark.system
@@ -140,7 +198,7 @@ def test_a_healthy_artery_gets_a_question_and_no_device(tmp_path):
         drop(page, tmp_path / "healthy.stl")
         page.wait_for_selector(".step.failed:nth-child(3)")
         playwright.expect(page.locator(".question h3")).to_have_text("No aneurysm found")
-        for title in ("Device", "Deploy", "Flow"):
+        for title in ("Treatment", "Deploy", "Flow"):
             step(page, title)
             playwright.expect(page.locator(".question h3")).to_be_visible()
             playwright.expect(page.locator(".panel input, .panel select")).to_have_count(0)
@@ -199,7 +257,7 @@ def test_sizes_are_sorted_compared_and_saved_as_a_picture(artery, tmp_path):
     with app_case.served(tmp_path / "cases") as client, browsing(client, 1024, 768) as page:
         drop(page, artery)
         page.wait_for_selector(".step.done:nth-child(3)")
-        step(page, "Device")
+        step(page, "Treatment")
         page.locator("[data-key=device-silk]").uncheck()
         page.wait_for_selector("[data-key=device-silk]:not(:checked)")
         page.get_by_role("button", name="Rank all sizes").click()
@@ -384,7 +442,7 @@ def whole_way(client, page, path):
         page.wait_for_selector(".step[aria-current=step]:has-text('" + title + "')")
         playwright.expect(page.locator(".right .sheet")).to_contain_text("mm³")
         assert in_time(page, lambda: drawn(page, page.locator(".viewer-area").bounding_box()) > 0.05)
-    step(page, "Device")
+    step(page, "Treatment")
     page.locator("[data-key=device-silk]").uncheck()
     page.wait_for_selector("[data-key=device-silk]:not(:checked)")
     page.get_by_role("button", name="Rank all sizes").click()
@@ -499,7 +557,7 @@ def test_a_new_user_ranks_devices_for_a_real_carotid_with_few_clicks(shared_data
         began, clicks = time.monotonic(), 0
         drop(page, shared_data / "aneurisk_C0038.vtp")
         page.wait_for_selector(".step.done:nth-child(3)")
-        clicks += follow(page, "Device →")
+        clicks += follow(page, "Treatment →")
         clicks += follow(page, "Rank all sizes")
         page.locator(".ranking tbody tr").first.wait_for(timeout=600 * SECOND)
         seconds = time.monotonic() - began

@@ -16,7 +16,7 @@ pytestmark = needs_browser
 
 AXE = Path(__file__).parents[2] / "viewer" / "node_modules" / "axe-core" / "axe.min.js"
 """Checker of accessibility; `npm ci` in viewer/ brings it."""
-STEPS = ("Image", "Vessel", "Sac and parent", "Device", "Deploy", "Flow", "Report")
+STEPS = ("Image", "Vessel", "Sac and parent", "Treatment", "Deploy", "Flow", "Report")
 
 
 @pytest.fixture
@@ -140,10 +140,10 @@ def find_again_where_it_is_offered(client, page):
     page.fill("#field-upstream_mm", "12")
     page.keyboard.press("Tab")
     page.wait_for_selector(".step.stale:nth-child(2)")
-    step(page, "Device")
+    step(page, "Treatment")
     with page.expect_request(lambda request: request.method == "POST" and request.url.endswith("/jobs/anatomy")):
         page.get_by_role("button", name="Find it again").click()
-    heading(page, "Device")
+    heading(page, "Treatment")
     client.delete("/api/cases/analytic/jobs")
 
 

@@ -1,8 +1,9 @@
-// An implant on the parent axis: handles at both ends that slide along it, the stent that follows, the cursor of the section.
+// An implant on its axis: handles at its ends that slide along it, the device that follows, the cursor of the section.
 import { make } from "../src/dom.js";
 import { get, Newest, post, postBinary } from "./api.js";
+import { Axis } from "./axis.js";
 import { label, makeHandle } from "./handles.js";
-import { reachOf, reachWords } from "./numbers.js";
+import { heightWords, reachOf, reachWords } from "./numbers.js";
 
 const STEP_MM = 0.2;
 const REST_MS = 400; // the bands are asked for when the device has lain still for so long, so that a drag never waits for them
@@ -30,11 +31,11 @@ export class Deploying {
 
   handle(end, i) {
     const element = makeHandle(end, `${end} end`, {
-      pulled: (event) => this.slide(end, this.axis.under(event, this.place.ends_mm[i])),
+      pulled: (event) => this.slide(end, this.way.under(event, this.place.ends_mm[i])),
       nudged: ([right, up]) => this.isHere && this.slide(end, (this.wanted ?? this.place.ends_mm[i]) + STEP_MM * (right + up)),
       released: () => this.release(),
     });
-    return { end, element, point: () => this.isHere && this.axis.at(this.place.ends_mm[i]) };
+    return { end, element, point: () => this.isHere && !(i && this.place.is_basket) && this.way.at(this.place.ends_mm[i]) };
   }
 
   slide(anchor, mm) {
@@ -63,7 +64,7 @@ export class Deploying {
   /** Where the device is let go: the last sketch may still be under way, and its place is the one to keep. */
   async atRest() {
     while (this.sketches.isBusy) await new Promise((resolve) => setTimeout(resolve, 15));
-    return this.place.center_mm;
+    return this.place.is_basket ? this.place.ends_mm[0] : this.place.center_mm;
   }
 
   /** Whether the implant in view is the one whose place is known. */
@@ -101,13 +102,13 @@ export class Deploying {
   take(answer) {
     this.place = answer.manifest;
     this.page.picture.put(answer);
+    const { axis, is_basket, profile, ends_mm, ends_band_mm = [], neck = this.page.anatomy.neck } = this.place;
+    this.way = axis ? new Axis(axis, this.page.picture) : this.axis;
     this.handles.forEach(({ element }, i) => {
-      const [mm, neck] = [this.place.ends_mm[i], this.page.anatomy.neck];
-      label(element, reachWords(i, mm, neck));
-      element.classList.toggle("bad", reachOf(i, mm, neck) < 0);
+      label(element, is_basket ? heightWords(ends_mm[0]) : reachWords(i, ends_mm[i], neck));
+      element.classList.toggle("bad", !is_basket && reachOf(i, ends_mm[i], neck) < 0);
     });
-    const { profile, ends_mm, ends_band_mm } = this.place;
-    this.page.along.set({ device: { profile, ends: ends_mm, bands: ends_band_mm } });
+    this.page.along.set({ device: axis ? null : { profile, ends: ends_mm, bands: ends_band_mm } });
     this.page.picture.stage?.redraw();
   }
 

@@ -26,7 +26,7 @@ export const STEPS = [
   ["image", "Image"],
   ["vessel", "Vessel"],
   ["sac", "Sac and parent"],
-  ["device", "Device"],
+  ["device", "Treatment"],
   ["deploy", "Deploy"],
   ["flow", "Flow"],
   ["report", "Report"],
@@ -335,7 +335,9 @@ class Page {
   render() {
     if (!this.view) return;
     this.frame.dataset.step = this.step;
+    const at = this.panel.querySelector(".catalogue")?.scrollTop;
     redraw(this.panel, ...panels[this.step](this));
+    if (at) this.panel.querySelector(".catalogue")?.scrollTo(0, at);
     this.renderScene();
     this.renderStrip();
     this.renderNumbers();
@@ -514,7 +516,8 @@ class Page {
     }
     if (this.isComparing) parts.push(head("Compared"), plainSheet(this.ranking.comparing.sheets(), this.isWhole));
     else if (["device", "deploy"].includes(this.step)) {
-      const sheets = this.view.choices.treatments.flatMap(({ name }) => this.measures[name] || []);
+      const isFirst = (one) => one === this.treatment && this.names.isBasket(one.implants[0].device); // others differ in their rows
+      const sheets = [...this.view.choices.treatments].sort((a, b) => isFirst(b) - isFirst(a)).flatMap(({ name }) => this.measures[name] || []);
       const [alike, others] = [true, false].map((isAlike) => sheets.filter(({ rows }) => (rows[0].key === sheets[0].rows[0].key) === isAlike));
       if (sheets.length) parts.push(head("Deployed"), plainSheet(alike, this.isWhole));
       for (const sheet of others.filter(({ rows }) => this.isWhole || rows.some((row) => row.is_first))) parts.push(make("h3", {}, [sheet.title]), plainSheet([sheet], this.isWhole));
@@ -529,10 +532,10 @@ class Page {
   toldTreatment(manifest, isWhole) {
     this.place = manifest;
     if (isWhole) {
-      const [low, high] = manifest.length_band_mm.map((mm) => mm.toFixed(1));
+      const [low, high] = (manifest.length_band_mm ?? []).map((mm) => mm.toFixed(1));
       const meaning = "Range for an uncertainty of the artery's diameters alone; the band beside the deployed length includes the device's numbers.";
       const range = { key: "length_range", name: "Deployed length, for the artery's diameters", meaning, source: "", cells: [`${low} to ${high}\u202fmm`], is_first: false };
-      this.measures[manifest.treatment] = manifest.measures.map((sheet) => ({ ...sheet, rows: sheet.title === manifest.title || manifest.measures.length === 1 ? [...sheet.rows, range] : sheet.rows }));
+      this.measures[manifest.treatment] = manifest.measures.map((sheet) => ({ ...sheet, rows: low && (sheet.title === manifest.title || manifest.measures.length === 1) ? [...sheet.rows, range] : sheet.rows }));
       this.advice = manifest.advice;
       this.renderNumbers();
       this.portrait.take(`${manifest.treatment} ${JSON.stringify(manifest.ends_mm)}`);
@@ -600,9 +603,12 @@ class Page {
     return this.choose(implantWith(name, id, changes));
   }
 
-  /** What the choices become when the middle of an implant is put to a place, or left to be proposed again (null). */
+  /** What the choices become when an implant is put to a place, or left to be proposed again (null). */
   moved(name, id, mm) {
-    return (choices) => implantWith(name, id, placedAt(choices.treatments.find((one) => one.name === name).implants.find((one) => one.id === id), mm))(choices);
+    return (choices) => {
+      const implant = choices.treatments.find((one) => one.name === name).implants.find((one) => one.id === id);
+      return implantWith(name, id, placedAt(implant, mm, this.names.isBasket(implant.device)))(choices);
+    };
   }
 
   chooseFlow(changes) {

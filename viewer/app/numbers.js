@@ -81,13 +81,16 @@ export function reachWords(i, mm, neck) {
   return reach === undefined ? `${mm.toFixed(1)} mm from inlet` : `${Math.abs(reach).toFixed(1)} mm ${reach < 0 ? "short of" : "beyond"} neck`;
 }
 
+/** Where the lower end of a basket lies, in words. */
+export const heightWords = (mm) => `${Math.abs(mm).toFixed(1)} mm ${mm < -0.05 ? "below" : "above"} neck`;
+
 /** Where a device lies, in words; its length with its band, once there is one. */
-export function placeWords({ length_mm, ends_mm }, bands, neck) {
+export function placeWords({ length_mm, width_mm, ends_mm, is_basket, neck }, bands, neckOfParent) {
   const [, , low, high, cause] = bands?.rows.find(([name]) => name === "Deployed length") || [];
-  const rows = [
-    ["Deployed length", `${length_mm.toFixed(1)} mm`, low ? `${low} to ${high}${cause ? `: ${cause}` : ""}` : "", false],
-    ...["Proximal end", "Distal end"].map((name, i) => [name, reachWords(i, ends_mm[i], neck), "", reachOf(i, ends_mm[i], neck) < 0]),
-  ];
+  const reach = (name, i) => [name, reachWords(i, ends_mm[i], neck ?? neckOfParent), "", reachOf(i, ends_mm[i], neck ?? neckOfParent) < 0];
+  const rows = is_basket
+    ? [["Width × height", `${width_mm.toFixed(1)} × ${length_mm.toFixed(1)} mm`, ""], ["Lower end", heightWords(ends_mm[0]), ""]]
+    : [["Deployed length", `${length_mm.toFixed(1)} mm`, low ? `${low} to ${high}${cause ? `: ${cause}` : ""}` : ""], reach("Proximal end", 0), reach("Distal end", 1)];
   return rows.map(([name, value, range, isShort]) => make("div", { className: "row" }, [make("span", {}, [name]), make("b", { className: isShort ? "bad" : "" }, [value]), make("small", {}, [range])]));
 }
 

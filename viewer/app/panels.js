@@ -1,7 +1,9 @@
 // The left side: what each step is, what can be chosen in it, and its one main button.
 import { button, make } from "../src/dom.js";
 import { bandWords, placeWords } from "./numbers.js";
-import { isOfDevice, withDevice } from "./treatments.js";
+import { isNested, isOfDevice, isPlaced, nested, withDevice } from "./treatments.js";
+
+const MOST_IMPLANTS = 3;
 
 /** Position of an opening, in the form of a study's settings. */
 export const placeOf = ({ center_mm }) => center_mm.map((x) => Number(x.toFixed(2)));
@@ -149,19 +151,23 @@ export const panels = {
     if (page.anatomy) parts.push(parentOutlet(page));
     if (page.anatomy?.drawn.curve_mm.length) parts.push(make("div", { className: "place" }, page.neckPlace), ...(page.view.choices.neck_mm ? [given(page, "neck_mm", "The neck was drawn by hand.")] : []));
     parts.push(...point(page, "at_mm", "Seed"), ...state(page), ...notes(page));
-    if (page.view.steps.sac === "done") parts.push(next(page, "device", "Device →"));
+    if (page.view.steps.sac === "done") parts.push(next(page, "device", "Treatment →"));
     return parts;
   },
 
   device(page) {
     const { job, choices, has_ranking } = page.view;
-    if (page.asksForAneurysm) return [...title("Device", "Which devices and sizes suit this artery."), question(page)];
+    if (page.asksForAneurysm) return [...title("Treatment", "Which devices and sizes suit this artery."), question(page)];
     const chosen = choices.treatments;
-    const parts = [...title("Device", "Choose up to three devices to compare. Every size of each is deployed in this artery and ranked."), ...earlier(page)];
-    const others = chosen.filter((treatment) => !isOfDevice(treatment));
-    parts.push(make("div", { className: "devices" }, [...others.map((treatment) => treatmentBox(page, treatment)), ...page.catalogue.map((design) => deviceBox(page, design))]));
-    parts.push(...state(page), ...flowsOfRanking(page));
-    if (!job) parts.push(main(has_ranking ? "Rank all sizes again" : "Rank all sizes", () => page.start("rank"), !page.view.has_anatomy || !chosen.length));
+    const parts = [...title("Treatment", "Choose up to three treatments to compare: one device, or several, each inside those before it."), ...earlier(page)];
+    const designOf = (treatment) => isOfDevice(treatment) && page.catalogue.find(({ key }) => key === treatment.name);
+    const rows = (treatment) => (designOf(treatment) ? deviceRows(page, designOf(treatment), treatment) : treatmentRows(page, treatment));
+    if (chosen.length) parts.push(make("div", { className: "devices chosen" }, chosen.flatMap(rows)));
+    parts.push(...catalogueParts(page));
+    const isRanked = chosen.some(({ implants }) => implants.some(({ device }) => !page.names.isBasket(device)));
+    parts.push(...state(page), ...(isRanked ? flowsOfRanking(page) : []));
+    if (!job) parts.push(main(has_ranking ? "Rank all sizes again" : "Rank all sizes", () => page.start("rank"), !page.view.has_anatomy || !isRanked));
+    if (chosen.length && !isRanked) parts.push(make("p", { className: "hint" }, ["Sizes of baskets are not ranked."]));
     parts.push(next(page, "deploy", "Deploy →"));
     return parts;
   },
@@ -169,8 +175,10 @@ export const panels = {
   deploy(page) {
     const { treatment, implant } = page;
     if (page.asksForAneurysm) return [...title("Deploy", "A device in the artery."), question(page)];
-    const parts = [...title("Deploy", "Drag either end along the artery. The deployed length follows, because the wires cannot stretch."), ...earlier(page)];
-    if (!treatment) return [...parts, make("p", { className: "note" }, ["Choose a device first."]), next(page, "device", "← Device")];
+    const isBasket = implant && page.names.isBasket(implant.device);
+    const lead = isBasket ? "Drag the lower end up into the sac or down. A basket that the sac compresses becomes taller, because the wires cannot stretch." : "Drag either end along the artery. The deployed length follows, because the wires cannot stretch.";
+    const parts = [...title("Deploy", lead), ...earlier(page)];
+    if (!treatment) return [...parts, make("p", { className: "note" }, ["Choose a treatment first."]), next(page, "device", "← Treatment")];
     const isHere = (told) => told?.treatment === treatment.name && told.implant === implant.id;
     parts.push(...shownTabs(page), ...sizes(page));
     const colour = "Colour of the wires";
@@ -218,7 +226,7 @@ export const panels = {
       const options = [["", "off"], ...[16, 32, 64].map((n) => [String(n), `${n} deployments`])];
       const asked = (count) => page.choose({ uncertainty_samples: count ? Number(count) : null });
       parts.push(select("sure", "Uncertainty", choices.uncertainty_samples ?? "", options, asked));
-      parts.push(make("p", { className: "hint" }, ["Deploys every device many times with varied threshold, landing and device diameter. The report then shows a 95 % interval for each result and its main causes."]));
+      parts.push(make("p", { className: "hint" }, ["Deploys every device many times with varied threshold, landing and device diameter. The report then shows a 95 % interval for each result and its main causes. Baskets and treatments of several devices are not varied."]));
       if (steps.report !== "done" && steps.flow === "done" && !job) parts.push(main("Write the report again", () => page.start("flow")));
     }
     if (steps.flow !== "done" && job?.kind !== "angiogram") {
@@ -351,30 +359,78 @@ function treatmentTick(page, key, treatment, isChosen) {
   return box;
 }
 
-const sizeWords = ({ diameter_mm, length_mm }) => (diameter_mm ? `${diameter_mm} × ${length_mm} mm` : "proposed");
+/** What devices are for, as the catalogue names it, and the heading above them. */
+const USES = { "flow diverter": "Flow diverters", "stent for coils": "Stents for coils", basket: "Baskets for the sac" };
 
-/** A treatment of several devices, or one with a name of its own, as the study that the case was opened from had it. */
-function treatmentBox(page, treatment) {
-  const isProposed = treatment.implants.every(({ diameter_mm }) => !diameter_mm);
-  return make("label", { className: "device", title: `Treatment ${treatment.name}` }, [
-    treatmentTick(page, treatment.name, treatment, true),
-    make("span", {}, [make("b", {}, [page.names.treatment(treatment.name)]), make("small", {}, [treatment.implants.map(({ id }) => page.names.implant(treatment.name, id)).join(", ")])]),
-    make("em", {}, isProposed ? [make("small", {}, ["proposed"])] : [treatment.implants.map(sizeWords).join(" + ")]),
-  ]);
+/** The devices that are not chosen yet, by what they are for, and a box that searches them by name, maker and use. */
+function catalogueParts(page) {
+  const isChosen = ({ key }) => page.view.choices.treatments.some((treatment) => treatment.name === key && isOfDevice(treatment));
+  const found = (design, use) => design.use === use && !isChosen(design) && `${design.name} ${design.maker} ${use}`.toLowerCase().includes((page.memory.find ?? "").toLowerCase());
+  const groups = Object.entries(USES).map(([use, words]) => [words, page.catalogue.filter((design) => found(design, use))]).filter(([, designs]) => designs.length);
+  const rows = groups.flatMap(([words, designs]) => [make("h3", {}, [words]), ...designs.flatMap((design) => deviceRows(page, design))]);
+  const find = make("input", { type: "search", className: "find", value: page.memory.find ?? "", placeholder: "Search devices", ariaLabel: "Search devices", data: { key: "find" }, onInput: () => ((page.memory.find = find.value), page.render()) });
+  return [find, make("div", { className: "devices catalogue", tabIndex: 0, role: "region", ariaLabel: "Devices" }, rows.length ? rows : [make("p", { className: "hint" }, ["No device has this in its name, maker or use."])])];
 }
 
-function deviceBox(page, design) {
-  const treatment = page.view.choices.treatments.find((one) => one.name === design.key && isOfDevice(one));
+const sizeWords = ({ diameter_mm, length_mm }) => (diameter_mm ? `${diameter_mm} × ${length_mm} mm` : "proposed");
+
+/** Put other implants in place of those of a treatment. */
+function rebuild(page, treatment, implants) {
+  const built = nested(implants);
+  const isThere = page.view.choices.treatments.some(({ name }) => name === built.name && name !== treatment.name);
+  if (isThere) page.tell(`${page.names.treatment(built.name)} is already in the list.`);
+  else page.choose(({ treatments }) => ({ treatments: treatments.map((one) => (one.name === treatment.name ? built : one)) }));
+  page.render();
+}
+
+/** A list of the stents that can be added inside a treatment. */
+function adding(page, treatment) {
+  const { implants } = treatment;
+  if (!isNested(treatment) || implants.length >= MOST_IMPLANTS || implants.some(({ device }) => page.names.isBasket(device))) return [];
+  const options = page.catalogue.filter(({ use }) => use !== "basket").map(({ key, name }) => make("option", { value: key }, [name]));
+  const add = () => rebuild(page, treatment, [...implants, ...withDevice(box.value).implants.map((implant) => ({ ...implant, placing: {} }))]);
+  let isKeyed = false; // by arrow keys and letters each device on the way is selected: then Enter adds
+  const onKeyDown = ({ key }) => {
+    isKeyed = true;
+    if (key === "Enter" && box.value) add();
+  };
+  const words = `Add a device inside ${page.names.treatment(treatment.name)}`;
+  const first = make("option", { value: "" }, ["+ Add a device inside"]);
+  const handlers = { onChange: () => isKeyed || add(), onKeyDown, onPointerDown: () => (isKeyed = false) };
+  const box = make("select", { className: "inside", title: "By keys: select, then Enter", ariaLabel: words, data: { key: `inside-${treatment.name}` }, ...handlers }, [first, ...options]);
+  return [make("div", { className: "implant" }, [box])];
+}
+
+/** A treatment of several devices, or one as the study that the case was opened from had it: its devices in order. */
+function treatmentRows(page, treatment) {
+  const { name, implants } = treatment;
+  const canChange = isNested(treatment) && implants.length > 1;
+  const swapped = (i, j) => implants.map((implant, k) => implants[k === i ? j : k === j ? i : k]);
+  const act = (sign, words, id, changed) => button(sign, () => rebuild(page, treatment, changed), { className: "icon", title: `${words} ${page.names.implant(name, id)}`, ariaLabel: `${words} ${page.names.implant(name, id)}` });
+  const row = ({ id, ...implant }, i) => {
+    const acts = [
+      ...(i ? [act("↑", "Deploy earlier:", id, swapped(i - 1, i))] : []),
+      ...(i < implants.length - 1 ? [act("↓", "Deploy later:", id, swapped(i, i + 1))] : []),
+      act("×", "Remove", id, implants.filter((_, k) => k !== i)),
+    ];
+    return make("div", { className: "implant" }, [make("span", {}, [page.names.implant(name, id), " ", make("small", {}, [sizeWords(implant)])]), ...(canChange ? acts : [])]);
+  };
+  const head = make("label", { className: "device", title: `Treatment ${name}` }, [treatmentTick(page, name, treatment, true), make("span", {}, [make("b", {}, [page.names.treatment(name)])])]);
+  return [head, ...implants.map(row), ...adding(page, treatment)];
+}
+
+/** A device of the catalogue: with its size where a treatment is of this device alone, else with how many of its numbers are cited. */
+function deviceRows(page, design, treatment) {
   const device = treatment?.implants[0];
-  const box = treatmentTick(page, design.key, withDevice(design.key), Boolean(treatment));
-  const size = device?.diameter_mm ? `${device.diameter_mm} × ${device.length_mm} mm` : device ? page.proposed?.sizes[design.key]?.replace(" x ", " × ") ?? "" : design.kind;
-  const mark = device && !device.diameter_mm ? [make("small", {}, ["proposed"])] : [];
-  const sure = `${design.n_facts - design.n_estimated} of ${design.n_facts} numbers are cited or derived, the rest estimated`;
-  return make("label", { className: "device", title: `${design.maker}, ${design.sizes.length} sizes; ${sure}` }, [
-    box,
+  const sure = `${design.n_cited} of ${design.n_facts} numbers are cited from a source`;
+  const size = device?.diameter_mm ? sizeWords(device) : page.proposed?.sizes[design.key]?.replace(" x ", " × ") ?? "";
+  const mark = device ? [size, ...(device.diameter_mm ? [] : [make("small", {}, ["proposed"])])] : [make("small", { className: "cited" }, [`${design.n_cited}/${design.n_facts} cited`])];
+  const row = make("label", { className: "device", title: `${design.maker}, ${design.sizes.length} sizes; ${sure}` }, [
+    treatmentTick(page, design.key, treatment ?? withDevice(design.key), Boolean(treatment)),
     make("span", {}, [make("b", {}, [design.name]), make("small", {}, [design.maker])]),
-    make("em", {}, [size, ...mark]),
+    make("em", {}, mark),
   ]);
+  return [row, ...(treatment ? adding(page, treatment) : [])];
 }
 
 /** The treatments, and the implants of the one in view where it has several. */
@@ -401,8 +457,9 @@ function sizes(page) {
     const [diameter_mm, length_mm] = text ? text.split(",").map(Number) : [null, null];
     page.changeImplant(treatment.name, device.id, { diameter_mm, length_mm });
   };
-  const recenter = link("Center it on the neck again", () => page.choose(page.moved(treatment.name, device.id, null)));
-  return [select("size", "Size", value, [["", words], ...options], change), ...(device.placing.position_mm === null ? [] : [recenter])];
+  const again = page.names.isBasket(device.device) ? "Put it on the neck again" : "Center it on the neck again";
+  const recenter = link(again, () => page.choose(page.moved(treatment.name, device.id, null)));
+  return [select("size", "Size", value, [["", words], ...options], change), ...(isPlaced(device) ? [recenter] : [])];
 }
 
 /** The angiogram: what is chosen for its films, or the button that computes it. */

@@ -8,6 +8,21 @@ export function withDevice(device, { diameter_mm = null, length_mm = null } = {}
 /** Whether a treatment is that of a single device, as the list of devices offers it. */
 export const isOfDevice = ({ name, implants }) => implants.length === 1 && implants[0].device === name;
 
+/** Whether a treatment is of stents in the parent artery, each inside those before it: its order can be changed. */
+export const isNested = ({ implants }) =>
+  implants.every(({ placing, inside }, i) => inside.length === i && (placing.path ?? "parent") === "parent" && !placing.beside?.length);
+
+/** A treatment of implants in the order of their deployment, each inside those before it, named as on the command line. */
+export function nested(implants) {
+  const named = [];
+  for (const implant of implants) {
+    let id = implant.device;
+    for (let n = 2; named.some((other) => other.id === id); n++) id = `${implant.device}_${n}`;
+    named.push({ ...implant, id, inside: named.map((other) => other.id) });
+  }
+  return { name: named.map(({ id }) => id).join("+"), implants: named };
+}
+
 /** What changes of one implant make of the choices. */
 export const implantWith = (name, id, changes) => ({ treatments }) => ({
   treatments: treatments.map((treatment) =>
@@ -15,8 +30,13 @@ export const implantWith = (name, id, changes) => ({ treatments }) => ({
   ),
 });
 
-/** The place of an implant whose middle was put somewhere, or which is left to be proposed (null). */
-export const placedAt = ({ placing }, mm) => ({ placing: { ...placing, position_mm: mm, anchor: "center", shift_mm: 0 } });
+/** The place of an implant whose middle, or lower end of a basket, was put somewhere, or which is left to be proposed (null). */
+export const placedAt = ({ placing }, mm, isBasket) => ({
+  placing: isBasket ? { ...placing, shift_mm: mm ?? 0 } : { ...placing, position_mm: mm, anchor: "center", shift_mm: 0, at_fork: false },
+});
+
+/** Whether an implant was placed by hand. */
+export const isPlaced = ({ placing }) => placing.position_mm !== null || placing.shift_mm !== 0;
 
 export class Names {
   /** @param catalogue the designs @param chosen() the chosen treatments */
@@ -27,6 +47,10 @@ export class Names {
 
   device(key) {
     return this.catalogue.find((design) => design.key === key)?.name || key;
+  }
+
+  isBasket(key) {
+    return this.catalogue.find((design) => design.key === key)?.use === "basket";
   }
 
   /** A treatment by its name: its devices, or the name that it was given. */

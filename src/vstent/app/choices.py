@@ -7,6 +7,7 @@ from typing import Annotated, Any, Final, Self, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model, field_validator, model_validator
 
 from vstent.devices.catalogue import baskets
+from vstent.devices.design import Coil
 from vstent.devices.treatment import Treatment
 from vstent.fields import POSITION, Option, check_all
 from vstent.flow.measured import MeasuredProfile
@@ -151,12 +152,16 @@ class Choices(OfVessel):
             if not treatment.implants:
                 raise ValueError("a treatment needs an implant")
             for implant in treatment.implants:
-                if implant.device.casefold() in baskets():
-                    raise ValueError(f"{implant.device} is a basket: plan it with vstent run on the command line")
-                if implant.placing.is_at_fork:
-                    raise ValueError(f"{implant.device} lies at a fork: plan it with vstent run on the command line")
+                if isinstance(baskets().get(implant.device.casefold()), Coil):
+                    raise ValueError(f"{implant.device} are coils: plan them with vstent run on the command line")
                 check_all(implant)
         return treatments
+
+    @property
+    def ranked(self) -> list[str]:
+        """Keys of the chosen devices whose sizes are ranked: all but baskets."""
+        chosen = sorted({device for treatment in self.treatments for device in treatment.devices})
+        return [device for device in chosen if device.casefold() not in baskets()]
 
     def settings(self, former: Settings) -> Settings:
         """Return the settings of the study; settings that the page cannot change are taken from `former`."""

@@ -23,23 +23,25 @@ from vstent.app.cuts import cut
 from vstent.app.films import films_message, kept_curves
 from vstent.app.finished import kept_histories, shown_flows
 from vstent.app.scans import LOCK
+from vstent.deployment.basket import room_of
 from vstent.deployment.contour import planes
 from vstent.deployment.coverage import together
 from vstent.deployment.deploy import propose_landing
 from vstent.deployment.measure import measure
 from vstent.deployment.method import laid_inside
 from vstent.deployment.sketch import MeasuredWall, Sketch, measured_wall, sketch
-from vstent.devices.catalogue import baskets, find_design
+from vstent.devices.catalogue import find_design
+from vstent.devices.design import Basket, Coil
 from vstent.devices.formulas import coverage_fraction, free_diameters_mm
 from vstent.devices.stent import Deployment, Landing, Stent
-from vstent.devices.treatment import BARE, Implant, Treatment, with_device
+from vstent.devices.treatment import BARE, Implant, Placing, Treatment, with_device
 from vstent.errors import DeviceError, InputError, ReadError, VstentError
 from vstent.flow.case import FlowField
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.problem import vessel_case
 from vstent.flow.settings import FlowSettings
 from vstent.geometry.surface import Surface
-from vstent.geometry.vessel import Anatomy, Opening
+from vstent.geometry.vessel import PARENT, Anatomy, Opening
 from vstent.io.archive import load_data
 from vstent.kernels import triangles
 from vstent.kernels.arrays import Floats
@@ -75,6 +77,10 @@ BESIDE_MM: Final = 8.0
 """Length of artery on each side of the neck that the profile view shows, in mm."""
 NEIGHBOURS: Final = 3
 """Number of consecutive wire points that have the color of one node, the nearest to the first of them."""
+BELOW_MM: Final = 3.0
+"""Largest depth of a basket's lower end below the middle of the neck to which it can be dragged, in mm."""
+HEIGHT_STEP_MM: Final = 0.05
+"""Step of the heights above the middle of the neck to which a basket can be dragged, in mm."""
 OPENING_COLOURS: Final = (
     (0.00, 0.45, 0.70),
     (0.90, 0.62, 0.00),
@@ -142,11 +148,9 @@ class Preview:
         return self._cached(("wall", self.case.state.anatomy, path, *asked, *_before(treatment, implant)), prepare)
 
     def _outer(self, treatment: Treatment, implant: Implant) -> list[Stent]:
-        """Return the deployed devices inside which an implant opens; a DeviceError says what the page cannot show."""
-        if implant.placing.is_at_fork:
-            raise DeviceError(f"{implant.device} lies at a fork: plan it with vstent run on the command line.")
-        if implant.device.casefold() in baskets():
-            raise DeviceError(f"{implant.device} is a basket: plan it with vstent run on the command line.")
+        """Return the deployed devices inside which an implant opens; a DeviceError says that it is coils."""
+        if isinstance(find_design(implant.device), Coil):
+            raise DeviceError(f"{implant.device} are coils: plan them with vstent run on the command line.")
         return [self.deployment(treatment, _implant(treatment, name)).stent for name in implant.inside]
 
     def _of_implant(self, what: str, treatment: Treatment, implant: Implant, compute: Callable[[], Found]) -> Found:
@@ -185,19 +189,20 @@ class Preview:
 
         def compute() -> dict[str, Any]:
             measures, deployment = self._measures(treatment, implant), self.deployment(treatment, implant)
+            if isinstance(deployment.stent.design, Basket):
+                return measures
             return measures | {"bands": bands_of(self.anatomy, deployment, measures, implant)}
 
         return self._of_implant("metrics", treatment, implant, compute)
 
-    def _wires(self, pane: str, treatment: Treatment, colour: Colour, but: str = "") -> list[LineLayer]:
-        """Return the wires of the deployed implants of a treatment, without those of the implant `but`."""
+    def _wires(self, pane: str, treatment: Treatment, colour: Colour) -> list[LineLayer]:
+        """Return the wires of the deployed implants of a treatment."""
         layers = []
         for implant in treatment.implants:
-            if implant.id != but:
-                found = self.deployment(treatment, implant)
-                measured = partial(node_coverage, found.stent)
-                coverage = partial(self._of_implant, "coverage", treatment, implant, measured)
-                layers.append(_wires(pane, found.stent, found.wall_gap_mm, colour, coverage))
+            found = self.deployment(treatment, implant)
+            measured = partial(node_coverage, found.stent)
+            coverage = partial(self._of_implant, "coverage", treatment, implant, measured)
+            layers.append(_wires(pane, found.stent, found.wall_gap_mm, colour, coverage))
         return layers
 
     def _drawn(self, pane: str, treatment: Treatment, colour: Colour) -> list[MeshLayer | LineLayer]:
@@ -218,6 +223,9 @@ class Preview:
     def bands_sheet(self, treatment: Treatment, implant: str, *, has_gaps: bool = False) -> dict[str, Any]:
         """Return the bands of a deployed implant as the page shows them; those of gaps take some seconds."""
         chosen = _implant(treatment, implant)
+        told: dict[str, Any] = {"treatment": treatment.name, "implant": implant}
+        if isinstance(find_design(chosen.device), Basket):
+            return told | {"sentence": "No ranges are computed for baskets.", "rows": []}
         with LOCK:
             metrics = self._metrics(treatment, chosen)
             anatomy, deployment = self.anatomy, self.deployment(treatment, chosen)
@@ -227,7 +235,6 @@ class Preview:
             gaps |= {name: band.metrics() for name, band in found.items()}
         bands = metrics["bands"]
         metrics = metrics | {"bands": bands | {"results": bands["results"] | gaps}}
-        told = {"treatment": treatment.name, "implant": implant}
         return told | {"sentence": how_sure(metrics), "rows": band_rows(metrics)}
 
     def follow(self, take: Callable[[tuple[Stent, ...]], None] | None) -> None:
@@ -262,11 +269,47 @@ class Preview:
         state, day = self.case.state, date.today().isoformat()
         chosen = state.choices.treatments
         if not chosen:
-            raise InputError("No device is chosen. Choose one in the step Device.")
+            raise InputError("No device is chosen. Choose one in the step Treatment.")
         with LOCK:
             found = {one.name: self.deployed(one) for one in chosen}
             metrics = {one.name: {part.id: self._metrics(one, part) for part in one.implants} for one in chosen}
             return plan_pdf(Planned(state.name, self.anatomy, found, metrics, state.source, day))
+
+    def _place(self, implant: Implant, stent: Stent, found: Sketch | Deployment | None) -> dict[str, Any]:
+        """Return the position of a device on its path; where it has a preview, with bands of uncertainty.
+
+        A path other than the parent artery comes with it.
+        """
+        ends = (stent.proximal_abscissa_mm, stent.distal_abscissa_mm)
+        told = {
+            "device": stent.design.key,
+            "size": stent.size.label,
+            "center_mm": stent.middle_abscissa_mm,
+            "ends_mm": ends,
+            "length_mm": stent.deployed_length_mm,
+        }
+        if isinstance(stent.design, Basket):
+            room = room_of(self.anatomy.aneurysms[0], stent.nodes_mm.shape[1])
+            heights_mm = np.arange(-BELOW_MM, room.height_mm, HEIGHT_STEP_MM)
+            points_mm = room.origin_mm + heights_mm[:, None] * room.frame[0]
+            width_mm = float(stent.row_diameter_mm.max())
+            return told | {"is_basket": True, "width_mm": width_mm, "axis": _axis(points_mm, heights_mm)}
+        if implant.placing.path != PARENT:
+            anatomy = on_path(self.anatomy, implant.placing.path)
+            span_mm = list(anatomy.parent.span_mm(anatomy.aneurysms[0])) if anatomy.aneurysms else []
+            axis = anatomy.parent.axis
+            told |= {"axis": _axis(axis.points_mm, axis.abscissa_mm), "neck": span_mm}
+        told["profile"] = np.round(np.stack([stent.row_abscissa_mm, stent.row_diameter_mm], axis=1), 3).tolist()
+        if not isinstance(found, Sketch):
+            return told
+        sketched = (found.stent.proximal_abscissa_mm, found.stent.distal_abscissa_mm)
+        told["ends_band_mm"] = [
+            [end + edge - middle for edge in sorted(band)]
+            for end, middle, band in zip(ends, sketched, (found.proximal_band_mm, found.distal_band_mm), strict=True)
+        ]
+        lengths = sorted(b - a for a, b in zip(found.proximal_band_mm, found.distal_band_mm, strict=True))
+        shift = stent.deployed_length_mm - (sketched[1] - sketched[0])
+        return told | {"length_band_mm": [length + shift for length in lengths]}
 
     # -- messages for the page -----------------------------------------------------------------------------------------
 
@@ -286,11 +329,7 @@ class Preview:
             [*anatomy_layers(anatomy), *(_disc(k, opening) for k, opening in enumerate(openings))],
             views=[view_of("profile", profile.axes, treated, 1.15), whole, *others],
             fade=1.2 * float(np.median(radius_mm)),
-            axis={
-                "points": np.round(axis.points_mm, 3).ravel().tolist(),
-                "abscissa": np.round(axis.abscissa_mm, 3).tolist(),
-                "diameter": np.round(2 * radius_mm, 3).tolist(),
-            },
+            axis=_axis(axis.points_mm, axis.abscissa_mm) | {"diameter": np.round(2 * radius_mm, 3).tolist()},
             is_oriented=anatomy.vessel.is_oriented,
             openings=[
                 {
@@ -342,47 +381,62 @@ class Preview:
         is_without = self.case.state.choices.without_aneurysm
         return self._cached(("proposed", self.case.state.anatomy, is_without, *devices), propose)
 
-    def sketch_message(self, treatment: Treatment, implant: str, landing: Landing | None, colour: Colour) -> bytes:
-        """Return the wires of an implant at its expected position, with the others of its treatment as deployed.
+    def _sketch(self, wall: MeasuredWall, implant: Implant) -> Sketch:
+        """Return the preview of an implant at its place, or at the proposed one, on a wall that is measured for it."""
+        anatomy = on_path(self.anatomy, implant.placing.path)
+        landing = landing_of(implant, anatomy, wall.size)
+        if landing is not None:
+            return sketch(wall, landing)
+        return laid_inside(partial(sketch, wall), propose_landing(wall.design, anatomy, wall.size))
 
-        The implant opens against the artery and the implants that it is inside of, at a landing; None: at the chosen
-        one, or at the proposed one where none is chosen.
+    def sketch_message(self, treatment: Treatment, implant: str, landing: Landing | None, colour: Colour) -> bytes:
+        """Return the wires of a treatment with one of its implants at a landing, or at its own place (None).
+
+        The implant opens against the artery and the implants that it is inside of; those inside of it follow it.
         """
         self._ask(treatment)
         with LOCK:
-            pane, chosen = treatment.name, _implant(treatment, implant)
-            wall, anatomy = self._wall(treatment, chosen), on_path(self.anatomy, chosen.placing.path)
-            landing = landing or landing_of(chosen, anatomy, wall.size)
-            if landing is None:
-                found = laid_inside(partial(sketch, wall), propose_landing(wall.design, anatomy, wall.size))
-            else:
-                found = sketch(wall, landing)
-            others = {one.id: self.deployment(treatment, one).stent for one in treatment.implants if one.id != implant}
-            self._show(tuple(others.get(one.id, found.stent) for one in treatment.implants))
-            wires = _wires(pane, found.stent, found.gap_mm, colour, lambda: _formula_coverage(found.stent))
-            layers = [wires, *self._wires(pane, treatment, colour, but=implant)]
-            place = _place(found, found.stent)
+            pane, followers = treatment.name, {implant}
+            drawn: dict[str, Sketch | Deployment] = {}
+            for one in treatment.implants:
+                is_moved, is_sketched = one.id == implant, _is_sketched(treatment, one)
+                if is_moved and is_sketched:
+                    drawn[one.id] = self._sketch(self._wall(treatment, one), _landed(one, landing))
+                elif is_moved:
+                    drawn[one.id] = self.deployment(treatment, _landed(one, landing))
+                elif is_sketched and followers & set(one.inside):
+                    followers.add(one.id)
+                    anatomy, size = on_path(self.anatomy, one.placing.path), self.deployment(treatment, one).stent.size
+                    inside = [drawn[name].stent for name in one.inside]
+                    wall = measured_wall(find_design(one.device), size, anatomy, inside)
+                    drawn[one.id] = self._sketch(wall, one)
+                else:
+                    drawn[one.id] = self.deployment(treatment, one)
+            self._show(tuple(one.stent for one in drawn.values()))
+            layers = [_wires(pane, *_seen(one), colour, partial(_covered, one.stent)) for one in drawn.values()]
+            place = self._place(_implant(treatment, implant), drawn[implant].stent, drawn[implant])
             return message(layers, scales_of(layers, self.anatomy), treatment=pane, implant=implant, **place)
 
     def deployment_message(self, treatment: Treatment, implant: str, colour: Colour) -> bytes:
         """Return a deployed treatment with its expansion and its metrics, and the place of one of its implants."""
         with LOCK:
             chosen, deployed = _implant(treatment, implant), self.deployed(treatment)
-            stent = deployed[implant].stent
+            found, stent = deployed[implant], deployed[implant].stent
             self._show(self.stents(treatment))
             layers = self._drawn(treatment.name, treatment, colour)
-            landing = landing_of(chosen, on_path(self.anatomy, chosen.placing.path), stent.size)
-            found = laid_inside(
-                partial(sketch, self._wall(treatment, chosen)), landing or Landing(stent.middle_abscissa_mm)
-            )
+            sketched: Sketch | None = None
+            if _is_sketched(treatment, chosen):
+                landing = landing_of(chosen, on_path(self.anatomy, chosen.placing.path), stent.size)
+                wall = self._wall(treatment, chosen)
+                sketched = laid_inside(partial(sketch, wall), landing or Landing(stent.middle_abscissa_mm))
             return message(
                 layers,
                 scales_of(layers, self.anatomy),
                 treatment=treatment.name,
                 implant=implant,
-                **_place(found, stent),
+                **self._place(chosen, stent, sketched),
                 title=treatment_title(deployed),
-                advice=deployed[implant].advice,
+                advice=found.advice,
                 measures=self._sheets(treatment),
             )
 
@@ -488,6 +542,11 @@ def _before(treatment: Treatment, implant: Implant) -> tuple[Implant, ...]:
     return tuple(found for one in inside for found in (*_before(treatment, one), one))
 
 
+def _axis(points_mm: Floats, abscissa_mm: Floats) -> dict[str, list[float]]:
+    """Return a curve as the page takes it: points (n, 3) and arc lengths (n,), in mm."""
+    return {"points": np.round(points_mm, 3).ravel().tolist(), "abscissa": np.round(abscissa_mm, 3).tolist()}
+
+
 def _opening_colour(opening: Opening) -> tuple[float, float, float]:
     """Return the color of an opening."""
     number = 0 if opening.is_inlet else int(opening.role.rpartition("_")[2])
@@ -531,32 +590,32 @@ def _wires(name: str, stent: Stent, gap_mm: Floats, colour: Colour, coverage: Ca
     )
 
 
-def _formula_coverage(stent: Stent) -> Floats:
+def _covered(stent: Stent) -> Floats:
     """Return the metal coverage (rows, columns) by the formula, from the diameter of every row."""
     of_row = [coverage_fraction(stent.design, stent.size, float(d)) for d in stent.row_diameter_mm]
     return np.broadcast_to(np.array(of_row)[:, None], stent.nodes_mm.shape[:2])
 
 
-def _place(found: Sketch, stent: Stent) -> dict[str, Any]:
-    """Return the position of a device, with bands of uncertainty around its ends."""
-    ends = (stent.proximal_abscissa_mm, stent.distal_abscissa_mm)
-    sketched = (found.stent.proximal_abscissa_mm, found.stent.distal_abscissa_mm)
-    bands = [
-        [end + edge - middle for edge in sorted(band)]
-        for end, middle, band in zip(ends, sketched, (found.proximal_band_mm, found.distal_band_mm), strict=True)
-    ]
-    lengths = sorted(b - a for a, b in zip(found.proximal_band_mm, found.distal_band_mm, strict=True))
-    shift = stent.deployed_length_mm - (sketched[1] - sketched[0])
-    return {
-        "device": stent.design.key,
-        "size": stent.size.label,
-        "center_mm": stent.middle_abscissa_mm,
-        "ends_mm": ends,
-        "ends_band_mm": bands,
-        "profile": np.round(np.stack([stent.row_abscissa_mm, stent.row_diameter_mm], axis=1), 3).tolist(),
-        "length_mm": stent.deployed_length_mm,
-        "length_band_mm": [length + shift for length in lengths],
-    }
+def _seen(found: Sketch | Deployment) -> tuple[Stent, Floats]:
+    """Return a device that is drawn, and its gaps (rows, columns) to the wall, in mm."""
+    return found.stent, found.gap_mm if isinstance(found, Sketch) else found.wall_gap_mm
+
+
+def _is_sketched(treatment: Treatment, implant: Implant) -> bool:
+    """Return whether an implant has a preview: it is a stent whose artery no implant on another path narrows."""
+    if isinstance(find_design(implant.device), Basket) or implant.placing.beside:
+        return False
+    return all(_implant(treatment, name).placing.path == implant.placing.path for name in implant.inside)
+
+
+def _landed(implant: Implant, landing: Landing | None) -> Implant:
+    """Return an implant at a landing; None leaves it where it is."""
+    if landing is None:
+        return implant
+    if isinstance(find_design(implant.device), Basket):
+        return replace(implant, placing=replace(implant.placing, shift_mm=landing.abscissa_mm))
+    there = Placing(implant.placing.path, landing.abscissa_mm, landing.anchor, beside=implant.placing.beside)
+    return replace(implant, placing=there)
 
 
 def _section(surface: Surface, center: Floats, frame: Floats) -> list[float]:
@@ -568,6 +627,7 @@ def _section(surface: Surface, center: Floats, frame: Floats) -> list[float]:
 
 
 def _row_at(stent: Stent, at_mm: float) -> int | None:
-    """Return the row of a device nearest to a plane across the parent axis; None where the plane misses it."""
-    is_there = stent.proximal_abscissa_mm <= at_mm <= stent.distal_abscissa_mm
+    """Return the row of a device nearest to a plane across the parent axis; None where it is not there."""
+    is_there = stent.path == PARENT and not isinstance(stent.design, Basket)
+    is_there = is_there and stent.proximal_abscissa_mm <= at_mm <= stent.distal_abscissa_mm
     return int(np.argmin(np.abs(stent.row_abscissa_mm - at_mm))) if is_there else None

@@ -58,7 +58,7 @@ def rank_sizes(case: Case, progress: OnProgress) -> None:
         progress(Progress("rank", min(n_done / n_all, 0.99), f"{n_done} of {n_all} sizes"))
 
     progress(Progress("rank", 0.0))
-    designs = [find_design(name) for name in settings.devices]
+    designs = [find_design(name) for name in case.state.choices.ranked]
     n_sizes = sum(len(design.sizes) for design in designs)
     jobs = min(os.cpu_count() or 1, MOST_PROCESSES, 1 + n_sizes // WORTH_A_PROCESS)
     found = rank(anatomy, designs, jobs=jobs, progress=told)

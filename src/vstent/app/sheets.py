@@ -26,6 +26,12 @@ FIRST: Final = {
     ),
     "device": (
         "deployed_length_mm",
+        "basket_width_mm",
+        "basket_height_mm",
+        "width_compression_fraction",
+        "protrusion_mm",
+        "neck_uncovered_fraction",
+        "volume_ratio_fraction",
         "neck_covered_fraction",
         "neck_metal_coverage_fraction",
         "neck_union_coverage_fraction",

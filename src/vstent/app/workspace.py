@@ -149,7 +149,11 @@ class Workspace:
         if not case.input.exists():
             raise ReadError(f"The scan of {case.state.name} has been moved from {case.input}. Put it back there.")
         if kind != "anatomy" and not case.state.choices.treatments:
-            raise InputError("No device is chosen. Choose one in the step Device.")
+            raise InputError("No device is chosen. Choose one in the step Treatment.")
+        if kind == "rank" and not case.state.choices.ranked:
+            raise InputError("Sizes of baskets are not ranked. Choose a device for arteries in the step Treatment.")
+        if kind == "rank" and not case.state.choices.ranked:
+            raise InputError("Sizes of baskets are not ranked. Choose a device for arteries in the step Treatment.")
         steps = statuses(case.state, "", lost_steps(case.folder, case.state))
         if kind == "angiogram" and not (case.state.choices.flow.is_wanted and steps["flow"] == "done"):
             raise InputError("The flow is out of date or not computed, and contrast moves with it. Run the step Flow.")
@@ -343,20 +347,22 @@ def begin_upload(case: Case, name: str) -> Path:
 
 
 def devices() -> list[dict[str, Any]]:
-    """Return the catalogue as the page lists it."""
-    from vstent.devices.catalogue import catalogue
+    """Return the catalogue with the baskets as the page lists it."""
+    from vstent.devices.catalogue import baskets, catalogue
+    from vstent.devices.design import Coil
 
     return [
         {
             "key": key,
             "name": design.name,
             "maker": design.maker,
-            "kind": design.kind.replace("_", "-"),
+            "use": design.use,
             "sizes": [[size.diameter_mm, size.length_mm] for size in design.sizes],
-            "n_estimated": sum(fact.confidence == "estimated" for fact in design.facts),
+            "n_cited": sum(fact.confidence == "cited" for fact in design.facts),
             "n_facts": len(design.facts),
         }
-        for key, design in catalogue().items()
+        for key, design in (catalogue() | baskets()).items()
+        if not isinstance(design, Coil)
     ]
 
 
@@ -366,7 +372,7 @@ def ranking(case: Case) -> dict[str, Any]:
     if not path.is_file():
         return {"rows": [], "is_current": False}
     found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    names = sorted({device for treatment in case.state.choices.treatments for device in treatment.devices})
+    names = case.state.choices.ranked
     is_current = found.get("anatomy") == case.state.anatomy and found.get("devices") == names
     return found | {"is_current": is_current}
 
