@@ -47,7 +47,7 @@ radius of bends, in wound diameters, from which a coil is stiffer; and stiffness
 DRAG, STEPS = 0.3, 8
 """Drag of a node, in bending stiffness per mm3 and step, and number of steps in which a coil enters by a segment."""
 SETTLING: Final = ((0.1, 300), (1.0, 300), (10.0, 200), (100.0, 200))
-"""Drag and steps of one round of the search for balance; less drag moves loops, more lets contacts come to rest."""
+"""Drag and steps of one round of the search for balance; less drag moves loops, more lets contacts settle."""
 ROUNDS, BALANCED = 12, 0.05
 """Largest number of such rounds, and what may remain of the contact forces."""
 TRIES, LEAST_NODES, KINKED = 5, 12, 1.1

@@ -228,8 +228,8 @@ def _check(stent: Stent, cell: Passage) -> None:
     if isinstance(stent.design, Braid):
         raise LandingError(
             f"A stent cannot pass through the wall of {stent.design.name}, a braid whose pores are "
-            f"{2 * cell.radius_mm:.2f} mm wide. Begin it at the fork (@ fork), place both side by side (|), or choose "
-            "a laser-cut stent before it."
+            f"{2 * cell.radius_mm:.2f} mm wide. Begin it at the fork (@ fork), place both side by side (|), choose a "
+            "laser-cut stent before it, or insist with & in place of +: both are then deployed as if alone."
         )
     if 2 * cell.radius_mm < CATHETER_MM:
         raise LandingError(

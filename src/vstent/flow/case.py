@@ -9,6 +9,7 @@ import numpy as np
 from vstent.deployment.struts import struts
 from vstent.devices.stent import Stent
 from vstent.flow.ends import End, FlowRate, Inflow, Resistance
+from vstent.flow.forks import arm_impedance
 from vstent.flow.settings import Blood, Numerics
 from vstent.flow.waveform import Waveform
 from vstent.geometry.surface import Surface, joined
@@ -142,6 +143,19 @@ class FlowCase:
         at_outlets = zip(self.resistances, np.nan_to_num(bare.outlet_pressure_Pa).tolist(), strict=True)
         known = (replace(end, resistance_Pa_s_mL=end.at(pressure_Pa)) for end, pressure_Pa in at_outlets)
         return replace(self, ends=(*self.ends[: len(self.vessel.inlets)], *known))
+
+    def followed(self, wrong_mL_s: Floats) -> Floats:
+        """Return by how much (m, k) to change the flows through resistances over a cycle, of which so much is wrong.
+
+        Every harmonic is the step of Newton's method for arms of the impedance of round tubes. A full step diverges
+        where a harmonic meets more resistance in the vessel than downstream.
+        """
+        count, ends = len(wrong_mL_s), self.resistances
+        rate_per_s = np.asarray(2 * np.pi / self.pulse.period_s * np.arange(count // 2 + 1), dtype=np.float64)
+        downstream = np.stack([end.at(0.0) * end.relative_impedance(rate_per_s) for end in ends], axis=1)
+        arms = arm_impedance(self.vessel, self.blood, rate_per_s)
+        part = 1 / (1 + arms / (downstream + downstream[:, :1]))
+        return np.fft.irfft(part * np.fft.rfft(wrong_mL_s, axis=0), count, axis=0)
 
     @property
     def pulse(self) -> Waveform:

@@ -2,9 +2,11 @@
 
 import numpy as np
 
+from vstent.flow.settings import Blood
 from vstent.geometry.vessel import Centerline, Vessel
 from vstent.kernels import curves
-from vstent.kernels.arrays import Floats, Ints
+from vstent.kernels.arrays import Complex, Floats, Ints
+from vstent.units import M3_PER_ML, M_PER_MM
 
 
 def shares_by_forks(vessel: Vessel, exponent: float) -> Floats:
@@ -38,6 +40,28 @@ def shares_by_forks(vessel: Vessel, exponent: float) -> Floats:
             shares[branch] *= share
         groups += branches
     return shares / shares.sum()
+
+
+def arm_impedance(vessel: Vessel, blood: Blood, rate_per_s: Floats) -> Complex:
+    """Return about how much harder (h, k) than the widest outlet the others are to change at angular frequencies (h,).
+
+    It is the impedance, Pa s/mL, of the way from the widest outlet back to the fork and on to each other outlet, as
+    inertia and Poiseuille's resistance of round sections.
+    """
+    ends = zip(vessel.centerlines, vessel.far_ends, strict=True)
+    lines = [line for line, end in ends if not end.is_inlet]
+    result = np.zeros((len(rate_per_s), len(lines)), dtype=complex)
+    for k, line in enumerate(lines[1:], start=1):
+        for one, other in ((line, lines[0]), (lines[0], line)):
+            is_arm = one.abscissa_mm >= _fork_mm(one, other)
+            step_m, radius_m = (
+                M_PER_MM * np.gradient(one.abscissa_mm)[is_arm],
+                M_PER_MM * one.inscribed_radius_mm[is_arm],
+            )
+            inertia = blood.density_kg_m3 * (step_m / (np.pi * radius_m**2)).sum()
+            drag = 8 * blood.viscosity_Pa_s * (step_m / (np.pi * radius_m**4)).sum()
+            result[:, k] += M3_PER_ML * (drag + 1j * rate_per_s * inertia)
+    return result
 
 
 def _fork_mm(line: Centerline, other: Centerline) -> float:

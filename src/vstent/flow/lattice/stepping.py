@@ -229,7 +229,7 @@ def _follow(state: State) -> None:
     missed = np.fft.rfft(asked_mL_s[:, outlet] - through_mL_s, axis=0)
     missed[0] = missed[LEARNED + 1 :] = 0.0
     flow_mL_s[:, outlet] += np.fft.irfft(missed, len(asked_mL_s), axis=0)
-    _ask(state, flow_mL_s)
+    _ask(state, asked_mL_s + state.case.followed(flow_mL_s - asked_mL_s))
 
 
 def _asked_mL_s(state: State) -> Floats:

@@ -258,14 +258,15 @@ def _follow(state: State) -> float:
     at_outlets_Pa = np.nan_to_num(sections_Pa)[:, len(case.vessel.inlets) :]
     period_s = np.inf if case.waveform is None else case.waveform.period_s
     inflow_mL_s = case.inflow_mL_s * case.inflow_factor(time_s)
-    flow_mL_s, moved = outflows(case.resistances, inflow_mL_s, at_outlets_Pa, period_s)[0], 0.0
+    flow_mL_s = outflows(case.resistances, inflow_mL_s, at_outlets_Pa, period_s)[0]
+    through_mL_s = np.array([one.outflow_mL_s for one in last])[:, len(case.vessel.inlets) :]
+    wrong_mL_s = flow_mL_s - through_mL_s
+    flow_mL_s = through_mL_s + (case.followed(wrong_mL_s) if state.phase_s else wrong_mL_s)
     for k, outlet in enumerate(case.vessel.outlets[1:], start=1):
         table_s = cycle_s(case)
         finer = np.interp(table_s, time_s % table_s[-1], flow_mL_s[:, k], period=table_s[-1])
         folders.set_outflow(state.folder, outlet.role, table_s, finer)
-        through_mL_s = [one.outflow_mL_s[len(case.vessel.inlets) + k] for one in last]
-        moved = max(moved, float(np.abs(flow_mL_s[:, k] - through_mL_s).max()) / case.inflow_mL_s)
-    return moved
+    return float(np.abs(wrong_mL_s).max()) / case.inflow_mL_s
 
 
 def _advice(state: State, outcome: Outcome) -> str:
