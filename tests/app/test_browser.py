@@ -11,6 +11,7 @@ import app_case
 import numpy as np
 import pytest
 from browsing import SECOND, at, browsing, drop, in_time, needs_browser, playwright, step
+from forks import PHANTOM
 
 from vstent import phantoms
 from vstent.cli import main
@@ -138,12 +139,12 @@ def test_a_treatment_is_built_reordered_and_taken_apart_by_keys(artery, tmp_path
 
 
 @pytest.mark.system
-def test_a_basket_is_chosen_pulled_out_of_the_sac_and_followed_by_the_blood(artery, tmp_path):
+def test_a_basket_is_chosen_and_pulled_out_of_the_sac(artery, tmp_path):
     with app_case.served(tmp_path / "cases") as client, browsing(client) as page:
         drop(page, artery)
         page.wait_for_selector(".step.done:nth-child(3)")
         view = client.get("/api/cases/phantom").json()
-        choices = view["choices"] | {"treatments": [], "flow": view["choices"]["flow"] | {"cell_size_mm": 0.4}}
+        choices = view["choices"] | {"treatments": []}
         client.put("/api/cases/phantom/choices", json={"revision": view["revision"], "choices": choices})
         step(page, "Treatment")
         page.locator("[data-key=device-web_sl]").check()
@@ -157,10 +158,35 @@ def test_a_basket_is_chosen_pulled_out_of_the_sac_and_followed_by_the_blood(arte
         playwright.expect(word).to_contain_text("below neck")
         page.wait_for_selector(".place .row:has-text('below neck')")
         assert in_time(page, lambda: chosen(client)["treatments"][0]["implants"][0]["placing"]["shift_mm"] < -0.3)
-        page.locator("#live-flow").check()
-        assert in_time(page, lambda: page.locator(".live-cards b").count() and inflow_percent(page) < -30, 240)
         page.get_by_role("button", name="Put it on the neck again").click()
         playwright.expect(word).to_have_text("0.0 mm above neck")
+
+
+@pytest.mark.system
+def test_a_y_is_made_of_two_stents_by_their_paths(tmp_path):
+    write_stl(tmp_path / "fork.stl", phantoms.phantom_surface(PHANTOM, edge_mm=0.4))
+    with app_case.served(tmp_path / "cases") as client, browsing(client) as page:
+        drop(page, tmp_path / "fork.stl")
+        page.wait_for_selector(".step.done:nth-child(3)")
+        step(page, "Treatment")
+        page.locator("[data-key=device-silk]").uncheck()
+        page.get_by_label("Add a device inside Enterprise").select_option("enterprise")
+        playwright.expect(page.locator(".implant > span")).to_have_count(2)
+        step(page, "Deploy")
+        for place, outlet in enumerate(("outlet_1", "outlet_2")):
+            page.get_by_role("button", name=f"{place + 1}. Enterprise").click()
+            page.locator("#field-size").select_option("4.5,22")
+            page.locator("#field-path").select_option(outlet)
+            assert in_time(page, lambda: page.locator("#field-path").input_value() == outlet)  # noqa: B023
+        (treatment,) = chosen(client)["treatments"]
+        assert [one["placing"]["path"] for one in treatment["implants"]] == ["outlet_1", "outlet_2"]
+        assert [one["inside"] for one in treatment["implants"]] == [[], ["enterprise"]]
+        before = place_of(page, "proximal")
+        drag(page, ".handle.proximal .knob", 0, -12)
+        assert in_time(page, lambda: abs(place_of(page, "proximal") - before) > 0.1)
+        assert in_time(
+            page, lambda: chosen(client)["treatments"][0]["implants"][1]["placing"]["position_mm"] is not None
+        )
 
 
 @pytest.mark.system

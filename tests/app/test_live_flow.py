@@ -76,6 +76,18 @@ def test_a_device_lowers_the_inflow_and_old_values_are_marked(preview: LiveFlowP
     assert told["history"][-1] == pytest.approx(told["reductions"]["neck_inflow_mL_s"], abs=2.0)
 
 
+def test_the_flow_follows_all_devices_of_a_treatment_and_baskets(preview: LiveFlowProcess, anatomy: Anatomy) -> None:
+    def settled(*stents: Stent) -> float:
+        preview.place(stents)
+        told = until(preview, lambda told: not told["is_stale"] and told["is_settled"])
+        return float(told["reductions"]["neck_inflow_mL_s"])
+
+    outer = vstent.deploy("silk", anatomy).stent
+    inner = vstent.deploy("silk", anatomy, inside=[outer]).stent
+    assert settled(outer, inner) < settled(outer) - 10.0
+    assert settled(vstent.deploy("web_sl", anatomy).stent) < -30.0
+
+
 def test_whoever_draws_a_device_does_not_wait_for_the_flow(preview: LiveFlowProcess, anatomy: Anatomy) -> None:
     """Devices are larger than the buffer of the pipe; while the process does not read, only the newest is kept."""
     stent = vstent.deploy(vstent.find_design("silk"), anatomy).stent

@@ -15,6 +15,7 @@ import app_case
 import numpy as np
 import pytest
 import report_case
+from forks import PHANTOM
 
 import vstent
 from vstent import phantoms
@@ -237,7 +238,7 @@ def test_a_second_tab_cannot_undo_what_the_first_has_done(client, case):
         {"treatments": [{"name": "silk", "implants": []}]},
         {"treatments": [alone("silk", nonsense=1)]},
         {"treatments": [alone("silk", inside=["enterprise"])]},
-        {"treatments": [alone("silk", placing={"path": "outlet_2"})]},
+        {"treatments": [alone("coils", density_fraction=0.25)]},
         {"treatments": [{"name": "../silk", "implants": SILK["implants"]}]},
         {"inlet_mm": [1.0, 2.0]},
         {"inlet_mm": [1.0, 2.0, 1e9]},
@@ -461,17 +462,6 @@ def test_of_two_implants_the_inner_opens_in_the_outer_and_is_deployed_again_wher
     assert (refused.status_code, "not among the implants" in refused.json()["detail"]) == (422, True)
 
 
-def test_stents_at_a_fork_are_left_to_the_command_line(client, case):
-    treatment = alone("silk", placing={"beside": ["outlet_2"]})
-    for refused in (
-        choose(client, case, treatments=[treatment]),
-        client.post(f"{case}/deployment", json=wanted(treatment)),
-        client.post(f"{case}/sketch", json=wanted(treatment)),
-    ):
-        assert refused.status_code == 422
-        assert "silk lies at a fork: plan it with vstent run on the command line" in refused.text
-
-
 def test_a_basket_is_deployed_measured_and_moved_along_the_axis_of_the_sac(client, case, workspace):
     anatomy, web = anatomy_of(client, case, workspace), alone("web_sl")
     assert choose(client, case, treatments=[web]).status_code == 200
@@ -505,7 +495,37 @@ def test_a_basket_is_deployed_measured_and_moved_along_the_axis_of_the_sac(clien
     both = {"name": "both", "implants": [SILK["implants"][0], inner]}
     refused = client.post(f"{case}/deployment", json=wanted(both))
     assert (refused.status_code, "lies in a sac alone" in refused.json()["detail"]) == (422, True)
+    refused = client.post(f"{case}/deployment", json=wanted(alone("coils")))
+    assert (refused.status_code, "plan them with vstent run" in refused.json()["detail"]) == (422, True)
     choose(client, case, treatments=[SILK])
+
+
+def test_stents_at_a_fork_are_shown_and_moved_on_their_own_paths(client, tmp_path):
+    write_stl(tmp_path / "fork.stl", phantoms.phantom_surface(PHANTOM, edge_mm=0.3))
+    name = client.post("/api/cases", json={"name": "fork"}).json()["id"]
+    case = f"/api/cases/{name}"
+    client.put(f"{case}/input", params={"name": "fork.stl"}, content=(tmp_path / "fork.stl").read_bytes())
+    client.post(f"{case}/input/done")
+    app_case.wait(client, name)
+    both = asdict(read_treatment("enterprise 4.5x22 > outlet_1 + enterprise 4.5x22 > outlet_2"))
+    assert choose(client, case, treatments=[both]).status_code == 200
+    first, second = (implant["id"] for implant in both["implants"])
+    told, raw = app_case.opened(client.post(f"{case}/deployment", json=wanted(both, implant=second)))
+    axis_mm = np.reshape(told["axis"]["points"], (-1, 3))
+    at_mm = axis_mm[np.searchsorted(told["axis"]["abscissa"], told["ends_mm"][1])]
+    distal_mm = wires_of(told, raw, both["name"])[1]
+    assert np.linalg.norm(distal_mm - at_mm, axis=1).min() < 2.0  # the radius of the arm
+    assert told["ends_mm"][0] < told["neck"][0] < told["neck"][1] < told["ends_mm"][1]
+    # Dragged, the second one passes through the first again.
+    at_mm = told["ends_mm"][0] - 0.5
+    dragged = wanted(both, implant=second, anchor="proximal", abscissa_mm=at_mm)
+    sketched, moved = app_case.opened(client.post(f"{case}/sketch", json=dragged))
+    assert sketched["ends_mm"][0] == pytest.approx(at_mm, abs=0.3)
+    wires_mm = [wires_of(*answer, both["name"])[0] for answer in ((told, raw), (sketched, moved))]
+    np.testing.assert_allclose(wires_mm[0], wires_mm[1], atol=4e-3)
+    section = client.get(f"{case}/section", params={"abscissa_mm": 8.0, "treatment": both["name"]}).json()
+    assert section["rings"] == []  # it is across the parent artery
+    assert client.post(f"{case}/bands", json=wanted(both, implant=first)).status_code == 200
 
 
 def test_a_section_through_two_implants_has_both_and_the_diameters_of_one(client, case):
@@ -679,6 +699,8 @@ def test_a_study_of_two_implants_opens_with_its_flow_and_numbers(flown, tmp_path
     measures = [{"device": "Silk", "size": f"4.00 x {length} mm"} for length in (15, 20)]
     silk["implants"] = dict(zip(("silk", "silk_2"), measures, strict=True))
     metrics["treatments"]["silk+silk_2"] = silk
+    ranked = {"treatment": "silk+silk_2", "score": 0.75, "is_suitable": True, "reason": "the flow"}
+    metrics["ranking"] = [ranked]
     (folder / "metrics.json").write_text(json.dumps(metrics))
     for name in ("bare", "silk+silk_2"):
         keep_flow(folder, told["input"]["sha256"], settings_of(told["settings"]), name)
@@ -690,7 +712,9 @@ def test_a_study_of_two_implants_opens_with_its_flow_and_numbers(flown, tmp_path
         assert [implant["inside"] for implant in treatment["implants"]] == [[], ["silk"]]
         assert treatment["implants"][1]["placing"]["shift_mm"] == -4.0
         assert app_case.opened(client.get(f"{case}/flow"))[0]["panes"] == ["bare", "silk+silk_2"]
-        (flow,) = client.get(f"{case}/numbers").json()["flow"]
+        numbers = client.get(f"{case}/numbers").json()
+        (flow,) = numbers["flow"]
+        assert numbers["ranking"] == [ranked]
         assert (flow["names"], flow["devices"]) == (["silk+silk_2"], ["Silk 4.00 x 15 mm + Silk 4.00 x 20 mm"])
 
 

@@ -11,7 +11,7 @@ import { Flowing } from "./flowing.js";
 import { Imaging } from "./imaging.js";
 import { sacMarks } from "./labels.js";
 import { Neck } from "./neck.js";
-import { bandWords, changeSheet, neckWords, placeWords, plainSheet, qualitySheet, sureSheet } from "./numbers.js";
+import { bandWords, changeSheet, neckWords, placeWords, plainSheet, qualitySheet, rankedSheet, sureSheet } from "./numbers.js";
 import { panels, placeOf, spokenRole } from "./panels.js";
 import { Picture } from "./picture.js";
 import { Ranking } from "./ranking.js";
@@ -513,6 +513,7 @@ class Page {
     if (["flow", "report"].includes(this.step) && flow) {
       const stale = this.view.steps.flow === "stale" ? [make("p", { className: "note stale" }, ["Settings have changed since this flow was computed: run the step Flow again."])] : [];
       parts.push(head("Before and after"), ...stale, changeSheet(flow, this.isWhole, (name) => this.names.treatment(name)), qualitySheet(flow));
+      if (this.sheets.ranking?.length) parts.push(...rankedSheet(this.sheets.ranking, (name) => this.names.treatment(name)));
     }
     if (this.isComparing) parts.push(head("Compared"), plainSheet(this.ranking.comparing.sheets(), this.isWhole));
     else if (["device", "deploy"].includes(this.step)) {

@@ -53,6 +53,13 @@ function cell(words, title, value, change, sense = "") {
   return make("div", {}, parts);
 }
 
+/** Treatments by their score, the best first, with the reasons. */
+export function rankedSheet(ranked, named) {
+  const row = ({ treatment, score, is_suitable, reason }, i) =>
+    make("li", { className: is_suitable ? "good" : "fair" }, [make("b", {}, [`${i + 1}. ${named(treatment)}: ${is_suitable ? `${(100 * score).toFixed(0)} of 100` : "ruled out"}`]), make("small", {}, [reason])]);
+  return [make("h2", {}, ["Treatments ranked"]), make("ul", { className: "qualities" }, ranked.map(row))];
+}
+
 /** Two numbers with their unit said once. */
 function span(low, high) {
   const [digits, unit] = low.split("\u202f");

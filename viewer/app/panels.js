@@ -459,7 +459,19 @@ function sizes(page) {
   };
   const again = page.names.isBasket(device.device) ? "Put it on the neck again" : "Center it on the neck again";
   const recenter = link(again, () => page.choose(page.moved(treatment.name, device.id, null)));
-  return [select("size", "Size", value, [["", words], ...options], change), ...(isPlaced(device) ? [recenter] : [])];
+  return [select("size", "Size", value, [["", words], ...options], change), ...paths(page), ...(isPlaced(device) ? [recenter] : [])];
+}
+
+/** The path on which the stent in view lies, where the artery divides. */
+function paths(page) {
+  const { treatment, implant } = page;
+  const outlets = (page.anatomy?.openings ?? []).map(({ role }) => role).filter((role) => role.startsWith("outlet"));
+  if (outlets.length < 2 || page.names.isBasket(implant.device) || implant.placing.beside.length) return [];
+  const pairs = outlets.flatMap((one, i) => outlets.slice(i + 1).map((other) => [one, other]));
+  const spoken = (role) => role.replace("_", " ");
+  const options = [["parent", "parent artery"], ...outlets.map((role) => [role, `inlet to ${spoken(role)}`]), ...pairs.map((pair) => [pair.join(">"), pair.map(spoken).join(" to ")])];
+  const change = (path) => page.changeImplant(treatment.name, implant.id, { placing: { path } });
+  return [select("path", "Path", implant.placing.path, options, change)];
 }
 
 /** The angiogram: what is chosen for its films, or the button that computes it. */

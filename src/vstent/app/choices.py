@@ -152,8 +152,8 @@ class Choices(OfVessel):
             if not treatment.implants:
                 raise ValueError("a treatment needs an implant")
             for implant in treatment.implants:
-                if implant.placing.is_at_fork:
-                    raise ValueError(f"{implant.device} lies at a fork: plan it with vstent run on the command line")
+                if isinstance(find_design(implant.device), Coil):
+                    raise ValueError(f"{implant.device} are coils: plan them with vstent run on the command line")
                 check_all(implant)
         return treatments
 

@@ -148,9 +148,9 @@ class Preview:
         return self._cached(("wall", self.case.state.anatomy, path, *asked, *_before(treatment, implant)), prepare)
 
     def _outer(self, treatment: Treatment, implant: Implant) -> list[Stent]:
-        """Return the deployed devices inside which an implant opens; a DeviceError says what the page cannot show."""
-        if implant.placing.is_at_fork:
-            raise DeviceError(f"{implant.device} lies at a fork: plan it with vstent run on the command line.")
+        """Return the deployed devices inside which an implant opens; a DeviceError says that it is coils."""
+        if isinstance(find_design(implant.device), Coil):
+            raise DeviceError(f"{implant.device} are coils: plan them with vstent run on the command line.")
         return [self.deployment(treatment, _implant(treatment, name)).stent for name in implant.inside]
 
     def _of_implant(self, what: str, treatment: Treatment, implant: Implant, compute: Callable[[], Found]) -> Found:

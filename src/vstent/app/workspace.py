@@ -280,10 +280,10 @@ class Workspace:
         return message([layer], views=[view_of("whole", FRONTAL, surface.vertices_mm)])
 
     def numbers(self, case: Case) -> dict[str, Any]:
-        """Return all results so far: anatomy, flow without and with devices, and uncertainty."""
+        """Return all results so far: anatomy, flow without and with devices, ranking of treatments, and uncertainty."""
         from vstent.app import sheets
 
-        found: dict[str, Any] = {"anatomy": [], "flow": [], "uncertainty": []}
+        found: dict[str, Any] = {"anatomy": [], "flow": [], "uncertainty": [], "ranking": []}
         if case.state.anatomy:
             found["anatomy"] = self.preview(case).anatomy_sheet()
         path, job = case.folder / "metrics.json", self.jobs.running(case)
@@ -291,6 +291,7 @@ class Workspace:
             metrics = json.loads(path.read_text(encoding="utf-8"))
             titles = _titles(metrics, case)
             found |= {"flow": sheets.flow(metrics, titles), "uncertainty": sheets.uncertainty(metrics, titles)}
+            found["ranking"] = metrics.get("ranking", [])
         return found
 
     def warm(self) -> None:

@@ -60,11 +60,6 @@ class Placing:
     beside: tuple[str, ...] = ()
     """Paths of implants side by side with it, by name; each has its share of the artery."""
 
-    @property
-    def is_at_fork(self) -> bool:
-        """Whether it concerns more than the parent artery."""
-        return self.path != Placing.path or self.at_fork or bool(self.beside)
-
 
 @dataclass(frozen=True)
 class Implant:
