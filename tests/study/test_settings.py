@@ -24,6 +24,8 @@ NO_OPTION = {
     "treatments.implants.id": IN_TEXT,
     "treatments.implants.inside": IN_TEXT,
     "treatments.implants.placing.path": IN_TEXT,
+    "treatments.implants.density_fraction": IN_TEXT,
+    "treatments.implants.seed": IN_TEXT,
     "treatments.implants.placing.at_fork": IN_TEXT,
     "treatments.implants.placing.beside": IN_TEXT,
     "treatments.implants.placing.anchor": "the middle; the page and Python set it",

@@ -152,8 +152,6 @@ class Choices(OfVessel):
             if not treatment.implants:
                 raise ValueError("a treatment needs an implant")
             for implant in treatment.implants:
-                if isinstance(find_design(implant.device), Coil):
-                    raise ValueError(f"{implant.device} are coils: plan them with vstent run on the command line")
                 check_all(implant)
         return treatments
 
