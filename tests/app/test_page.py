@@ -305,7 +305,7 @@ def test_deployed_numbers_are_those_of_the_measures(client, case, workspace):
     lengths = next(row for row in sheet["rows"] if row[0] == "Deployed length")
     low, value, high = (float(lengths[k].split("\u202f")[0]) for k in (2, 1, 3))
     assert low < value < high
-    assert "Numbers of Silk: 2 cited" in sheet["sentence"]
+    assert "Sources of the numbers of Silk: 2 cited" in sheet["sentence"]
     with_gaps = client.post(f"{case}/bands?gaps=true", json=wanted(silk), timeout=300).json()
     assert [row for row in with_gaps["rows"] if row in sheet["rows"]] == sheet["rows"]
     assert len(with_gaps["rows"]) == len(sheet["rows"]) + 2

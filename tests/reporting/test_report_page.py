@@ -272,7 +272,7 @@ def test_how_sure_a_flow_is_is_no_change_but_told():
 def test_ratios_and_openings_go_by_the_words_of_what_they_are_of():
     named = {
         "mean_wss_Pa_ratio": "Wall shear stress, mean, after / before",
-        "relative_low_shear_area_fraction_ratio": "Low shear area, relative, after / before",
+        "relative_low_shear_area_fraction_ratio": "Sac wall under low shear stress, relative, after / before",
         "outlet_3_flow_mL_s": "Outlet flow, outlet 3",
         "outlet_3_flow_mL_s_ratio": "Outlet flow, outlet 3, after / before",
         "inlet_2_flow_mL_s": "Inlet flow, inlet 2",

@@ -313,7 +313,7 @@ export class SliceView {
     }
     context.setLineDash([]);
     context.globalAlpha = 1;
-    word(context, isIn ? "Seed" : `Seed ${away.toFixed(1)} mm off`, x + 11, y - 9, SEED);
+    word(context, isIn ? "Seed" : `Seed ${away.toFixed(1)} mm from this slice`, x + 11, y - 9, SEED);
   }
 
   paintRulers(context) {

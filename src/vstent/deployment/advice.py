@@ -24,7 +24,7 @@ SHORT_MM: Final = 0.1
 """Length, in mm, by which the margin beyond the neck may be missed, since the deployed length is only estimated."""
 OFF_MM: Final = 0.5
 """Distance from the parent artery, in mm, beyond which a neck also opens into another branch."""
-BRAIDED: Final = "Choose a braided device."
+BRAIDED: Final = "Braided devices follow bends better."
 """Remedy for a device whose struts cannot follow a bend."""
 
 

@@ -58,4 +58,4 @@ def how_sure(design: Design) -> str:
     """Return one sentence on how well the numbers of a device are known."""
     levels = Counter(fact.confidence for fact in design.facts)
     counted = ", ".join(f"{levels[level]} {level}" for level in ("cited", "derived", "estimated") if levels[level])
-    return f"Numbers of {design.name}: {counted}." if counted else f"{design.name} has no sources."
+    return f"Sources of the numbers of {design.name}: {counted}." if counted else f"{design.name} has no sources."

@@ -49,7 +49,7 @@ class Row(NamedTuple):
 def number_name(name: str) -> str:
     """Return the display name of a number of the catalogue; further groups of wires have their number."""
     group = re.fullmatch(r"wire_(\d+)_(\w+)", name)
-    return f"{NUMBERS[f'wire_{group[2]}']}, group {group[1]}" if group else NUMBERS.get(name, name)
+    return f"{NUMBERS[f'wire_{group[2]}']} (wires of kind {group[1]})" if group else NUMBERS.get(name, name)
 
 
 def band_rows(implant: Mapping[str, Any]) -> list[Row]:
