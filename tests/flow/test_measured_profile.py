@@ -107,7 +107,9 @@ def test_the_flow_follows_from_the_table_unless_one_is_given(tmp_path: Path) -> 
     assert isinstance(case.ends[0], Inflow)
     assert case.ends[0].mean_mL_s == pytest.approx(FLOW_ML_S, rel=0.01)
     assert case.inflow_source.startswith("measured: mean 0.30 m/s through 19.7 mm2, 0 degrees from the normal")
-    assert vessel_case(vessel, replace(settings, inflow_mL_s=3.0)).inflow_mL_s == 3.0
+    given = vessel_case(vessel, replace(settings, inflow_mL_s=3.0))
+    assert given.inflow_mL_s == 3.0
+    assert given.inflow_source.startswith("profile measured: ")
     field = simulate_case(case)
     assert field.is_converged
     assert field.inlets_mL_s[0] == pytest.approx(case.inflow_mL_s, rel=3e-3)

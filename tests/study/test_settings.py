@@ -129,3 +129,23 @@ def test_a_size_of_a_treatment_out_of_range_is_refused_on_the_page() -> None:
 def test_sizes_without_a_device_are_refused() -> None:
     with pytest.raises(InputError, match="belong to --device"):
         settings_of({"treatment": STATED["treatment"][1].treatments, "length": 20.0})
+
+
+@pytest.mark.parametrize(
+    ("text", "flow_mL_s", "speed_m_s"),
+    [("4.1", 4.1, None), ("246 mL/min", 4.1, None), ("4.1mL/s", 4.1, None), ("0.27 m/s", None, 0.27)],
+)
+def test_a_flow_rate_has_its_unit(text: str, flow_mL_s: float | None, speed_m_s: float | None) -> None:
+    flow = settings_of({"flow-rate": OPTIONS["flow-rate"].value(text)}).flow
+    assert flow is not None
+    assert flow.inflow_mL_s == (None if flow_mL_s is None else pytest.approx(flow_mL_s))
+    assert flow.inlet_speed_m_s == speed_m_s
+
+
+def test_another_unit_and_two_inflows_are_refused() -> None:
+    with pytest.raises(InputError, match="'4 L/min' has another unit: give mL/s, mL/min or m/s"):
+        OPTIONS["flow-rate"].value("4 L/min")
+    with pytest.raises(InputError, match=r"inlet speed: 27 m/s is out of range: .* \(27 cm/s are 0.27 m/s\)"):
+        settings_of({"flow-rate": OPTIONS["flow-rate"].value("27 m/s")})
+    with pytest.raises(InputError, match="both state the inflow: leave out one of them"):
+        settings_of({"flow-rate": 4.0, "inlet-speed": 0.3})

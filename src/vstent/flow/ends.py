@@ -165,7 +165,8 @@ def _inflow(inlets: Sequence[Opening], settings: FlowSettings) -> tuple[Floats, 
             "the inlet profile has times, and another waveform is given: leave out --pulsatile or the times"
         )
     measured_mL_s = np.array([profile.section.flow_mL_s.mean()])
-    return given_mL_s if is_given else measured_mL_s, profile.section.described(inlets[0].normal)
+    described = profile.section.described(inlets[0].normal)
+    return (given_mL_s, f"profile {described}") if is_given else (measured_mL_s, described)
 
 
 def _shares(vessel: Vessel, settings: FlowSettings) -> Floats:
