@@ -391,7 +391,8 @@ class Preview:
             for key in devices:
                 with suppress(VstentError):
                     self._ask(with_device(key))
-                    sizes[key] = size_of(Implant(key, key), self.anatomy).label
+                    if not isinstance(find_design(key), Coil):  # which have a density instead
+                        sizes[key] = size_of(Implant(key, key), self.anatomy).label
             return {"inflow_mL_s": case.inflow_mL_s, "cell_size_mm": default_cell_size_mm(case), "sizes": sizes}
 
         is_without = self.case.state.choices.without_aneurysm
