@@ -148,7 +148,7 @@ def test_a_basket_is_chosen_and_pulled_out_of_the_sac(artery, tmp_path):
         client.put("/api/cases/phantom/choices", json={"revision": view["revision"], "choices": choices})
         step(page, "Treatment")
         page.locator("[data-key=device-web_sl]").check()
-        playwright.expect(page.locator(".panel .hint")).to_have_text("Sizes of baskets are not ranked.")
+        playwright.expect(page.locator(".panel .hint")).to_have_text("Sizes of baskets and coils are not ranked.")
         step(page, "Deploy")
         word = page.locator(".handle.proximal .handle-word")
         playwright.expect(word).to_have_text("0.0 mm above neck", timeout=120 * SECOND)

@@ -28,7 +28,7 @@ from vstent.cli import main
 from vstent.deployment.deploy import deploy, propose_landing
 from vstent.deployment.measure import measure
 from vstent.devices.catalogue import find_design
-from vstent.devices.stent import Landing
+from vstent.devices.stent import Coils, Deployment, Landing
 from vstent.devices.treatment import read_treatment, with_device
 from vstent.errors import ReadError
 from vstent.fields import stated
@@ -238,7 +238,6 @@ def test_a_second_tab_cannot_undo_what_the_first_has_done(client, case):
         {"treatments": [{"name": "silk", "implants": []}]},
         {"treatments": [alone("silk", nonsense=1)]},
         {"treatments": [alone("silk", inside=["enterprise"])]},
-        {"treatments": [alone("coils", density_fraction=0.25)]},
         {"treatments": [{"name": "../silk", "implants": SILK["implants"]}]},
         {"inlet_mm": [1.0, 2.0]},
         {"inlet_mm": [1.0, 2.0, 1e9]},
@@ -490,13 +489,35 @@ def test_a_basket_is_deployed_measured_and_moved_along_the_axis_of_the_sac(clien
     assert (section["rings"], "device_diameter_mm" in section) == ([], False)
     assert client.get(f"{case}/plan.pdf").content.count(b"/MediaBox") == 1
     refused = client.post(f"{case}/jobs/rank")
-    assert (refused.status_code, "baskets are not ranked" in refused.json()["detail"]) == (422, True)
+    assert (refused.status_code, "baskets and coils are not ranked" in refused.json()["detail"]) == (422, True)
     inner = {"id": "web", "device": "web_sl", "inside": ["silk"]}
     both = {"name": "both", "implants": [SILK["implants"][0], inner]}
     refused = client.post(f"{case}/deployment", json=wanted(both))
     assert (refused.status_code, "lies in a sac alone" in refused.json()["detail"]) == (422, True)
-    refused = client.post(f"{case}/deployment", json=wanted(alone("coils")))
-    assert (refused.status_code, "plan them with vstent run" in refused.json()["detail"]) == (422, True)
+    choose(client, case, treatments=[SILK])
+
+
+def test_coils_are_shown_as_the_study_has_placed_them(client, case, workspace):
+    anatomy, treatment = anatomy_of(client, case, workspace), read_treatment("coils(4%)")
+    chosen = asdict(treatment)
+    assert choose(client, case, treatments=[chosen]).status_code == 200
+    refused = client.post(f"{case}/deployment", json=wanted(chosen))
+    assert (refused.status_code, "These coils are not placed yet" in refused.json()["detail"]) == (422, True)
+    design, sac = find_design("coils"), anatomy.aneurysms[0].sac
+    turn = np.linspace(0.0, 2 * np.pi, 50)
+    loop_mm = sac.vertices_mm.mean(axis=0) + np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+    flat = np.zeros((0, 0, 3)), np.zeros(0), loop_mm, np.array([0, 50]), np.array([design.wound_diameter_um])
+    coils = Coils(design, design.sizes[0], *flat, coils=design.sizes[:1], sac=sac)
+    none = {"history_mm": np.zeros((1, 0, 0, 3)), "energy_mm2": np.zeros(1), "wall_gap_mm": np.zeros((0, 0))}
+    placed = Deployment(coils, "terminated", "One loop.", terminated_fraction=np.ones(1), seconds=0.0, **none)
+    state = Cases(workspace).get(case.rpartition("/")[2]).state
+    key = study_keys(state.source, replace(state.settings(), treatments=(treatment,)))["deploy coils"]
+    folder = workspace / case.rpartition("/")[2]
+    stored.Store(folder / CACHE).save("deploy coils", key, placed)
+    told, raw = app_case.opened(client.post(f"{case}/deployment", json=wanted(chosen)))
+    assert (told["is_coils"], told["advice"]) == (True, "One loop.")
+    np.testing.assert_allclose(wires_of(told, raw, "coils")[0], loop_mm, atol=2e-3)
+    assert client.get(f"{case}/proposed").json()["sizes"] == {}
     choose(client, case, treatments=[SILK])
 
 

@@ -35,7 +35,7 @@ export class Deploying {
       nudged: ([right, up]) => this.isHere && this.slide(end, (this.wanted ?? this.place.ends_mm[i]) + STEP_MM * (right + up)),
       released: () => this.release(),
     });
-    return { end, element, point: () => this.isHere && !(i && this.place.is_basket) && this.way.at(this.place.ends_mm[i]) };
+    return { end, element, point: () => this.isHere && !this.place.is_coils && !(i && this.place.is_basket) && this.way.at(this.place.ends_mm[i]) };
   }
 
   slide(anchor, mm) {
@@ -102,6 +102,7 @@ export class Deploying {
   take(answer) {
     this.place = answer.manifest;
     this.page.picture.put(answer);
+    if (this.place.is_coils) return this.page.along.set({ device: null });
     const { axis, is_basket, profile, ends_mm, ends_band_mm = [], neck = this.page.anatomy.neck } = this.place;
     this.way = axis ? new Axis(axis, this.page.picture) : this.axis;
     this.handles.forEach(({ element }, i) => {

@@ -92,7 +92,8 @@ export function reachWords(i, mm, neck) {
 export const heightWords = (mm) => `${Math.abs(mm).toFixed(1)} mm ${mm < -0.05 ? "below" : "above"} neck`;
 
 /** Where a device lies, in words; its length with its band, once there is one. */
-export function placeWords({ length_mm, width_mm, ends_mm, is_basket, neck }, bands, neckOfParent) {
+export function placeWords({ length_mm, width_mm, ends_mm, is_basket, is_coils, neck }, bands, neckOfParent) {
+  if (is_coils) return [];
   const [, , low, high, cause] = bands?.rows.find(([name]) => name === "Deployed length") || [];
   const reach = (name, i) => [name, reachWords(i, ends_mm[i], neck ?? neckOfParent), "", reachOf(i, ends_mm[i], neck ?? neckOfParent) < 0];
   const rows = is_basket

@@ -164,10 +164,10 @@ export const panels = {
     const rows = (treatment) => (designOf(treatment) ? deviceRows(page, designOf(treatment), treatment) : treatmentRows(page, treatment));
     if (chosen.length) parts.push(make("div", { className: "devices chosen" }, chosen.flatMap(rows)));
     parts.push(...catalogueParts(page));
-    const isRanked = chosen.some(({ implants }) => implants.some(({ device }) => !page.names.isBasket(device)));
+    const isRanked = chosen.some(({ implants }) => implants.some(({ device }) => page.names.isStent(device)));
     parts.push(...state(page), ...(isRanked ? flowsOfRanking(page) : []));
     if (!job) parts.push(main(has_ranking ? "Rank all sizes again" : "Rank all sizes", () => page.start("rank"), !page.view.has_anatomy || !isRanked));
-    if (chosen.length && !isRanked) parts.push(make("p", { className: "hint" }, ["Sizes of baskets are not ranked."]));
+    if (chosen.length && !isRanked) parts.push(make("p", { className: "hint" }, ["Sizes of baskets and coils are not ranked."]));
     parts.push(next(page, "deploy", "Deploy →"));
     return parts;
   },
@@ -177,7 +177,8 @@ export const panels = {
     if (page.asksForAneurysm) return [...title("Deploy", "A device in the artery."), question(page)];
     const isBasket = implant && page.names.isBasket(implant.device);
     const lead = isBasket ? "Drag the lower end up into the sac or down. A basket that the sac compresses becomes taller, because the wires cannot stretch." : "Drag either end along the artery. The deployed length follows, because the wires cannot stretch.";
-    const parts = [...title("Deploy", lead), ...earlier(page)];
+    const isStudys = implant && !isBasket && !page.names.isStent(implant.device);
+    const parts = [...title("Deploy", isStudys ? "The coils as the study has placed them." : lead), ...earlier(page)];
     if (!treatment) return [...parts, make("p", { className: "note" }, ["Choose a treatment first."]), next(page, "device", "← Treatment")];
     const isHere = (told) => told?.treatment === treatment.name && told.implant === implant.id;
     parts.push(...shownTabs(page), ...sizes(page));
@@ -383,10 +384,13 @@ function rebuild(page, treatment, implants) {
   page.render();
 }
 
+/** Whether devices of a treatment can be added, moved and removed. */
+const canBuild = (page, treatment) => isNested(treatment) && treatment.implants.every(({ device }) => page.names.isStent(device));
+
 /** A list of the stents that can be added inside a treatment. */
 function adding(page, treatment) {
   const { implants } = treatment;
-  if (!isNested(treatment) || implants.length >= MOST_IMPLANTS || implants.some(({ device }) => page.names.isBasket(device))) return [];
+  if (!canBuild(page, treatment) || implants.length >= MOST_IMPLANTS) return [];
   const options = page.catalogue.filter(({ use }) => use !== "basket").map(({ key, name }) => make("option", { value: key }, [name]));
   const add = () => rebuild(page, treatment, [...implants, ...withDevice(box.value).implants.map((implant) => ({ ...implant, placing: {} }))]);
   let isKeyed = false; // by arrow keys and letters each device on the way is selected: then Enter adds
@@ -404,7 +408,7 @@ function adding(page, treatment) {
 /** A treatment of several devices, or one as the study that the case was opened from had it: its devices in order. */
 function treatmentRows(page, treatment) {
   const { name, implants } = treatment;
-  const canChange = isNested(treatment) && implants.length > 1;
+  const canChange = canBuild(page, treatment) && implants.length > 1;
   const swapped = (i, j) => implants.map((implant, k) => implants[k === i ? j : k === j ? i : k]);
   const act = (sign, words, id, changed) => button(sign, () => rebuild(page, treatment, changed), { className: "icon", title: `${words} ${page.names.implant(name, id)}`, ariaLabel: `${words} ${page.names.implant(name, id)}` });
   const row = ({ id, ...implant }, i) => {
@@ -447,6 +451,7 @@ function shownTabs(page) {
 function sizes(page) {
   const { treatment, implant: device } = page;
   const design = page.catalogue.find(({ key }) => key === device.device);
+  if (!design) return []; // coils
   const isHere = page.place?.treatment === treatment.name && page.place.implant === device.id;
   const proposed = isHere ? page.place.size.match(/([\d.]+) x ([\d.]+)/) : null;
   const now = [device.diameter_mm ?? Number(proposed?.[1] ?? 0), device.length_mm ?? Number(proposed?.[2] ?? 0)];
@@ -459,14 +464,14 @@ function sizes(page) {
   };
   const again = page.names.isBasket(device.device) ? "Put it on the neck again" : "Center it on the neck again";
   const recenter = link(again, () => page.choose(page.moved(treatment.name, device.id, null)));
-  return [select("size", "Size", value, [["", words], ...options], change), ...paths(page), ...(isPlaced(device) ? [recenter] : [])];
+  return [select("size", "Size", value, [["", words], ...options], change), ...(page.names.isStent(device.device) ? paths(page) : []), ...(isPlaced(device) ? [recenter] : [])];
 }
 
 /** The path on which the stent in view lies, where the artery divides. */
 function paths(page) {
   const { treatment, implant } = page;
   const outlets = (page.anatomy?.openings ?? []).map(({ role }) => role).filter((role) => role.startsWith("outlet"));
-  if (outlets.length < 2 || page.names.isBasket(implant.device) || implant.placing.beside.length) return [];
+  if (outlets.length < 2 || implant.placing.beside.length) return [];
   const pairs = outlets.flatMap((one, i) => outlets.slice(i + 1).map((other) => [one, other]));
   const spoken = (role) => role.replace("_", " ");
   const options = [["parent", "parent artery"], ...outlets.map((role) => [role, `inlet to ${spoken(role)}`]), ...pairs.map((pair) => [pair.join(">"), pair.map(spoken).join(" to ")])];

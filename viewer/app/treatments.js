@@ -53,6 +53,11 @@ export class Names {
     return this.catalogue.find((design) => design.key === key)?.use === "basket";
   }
 
+  /** Whether a device lies in an artery: it is neither a basket nor coils, which the catalogue of the page has not. */
+  isStent(key) {
+    return this.catalogue.some((design) => design.key === key && design.use !== "basket");
+  }
+
   /** A treatment by its name: its devices, or the name that it was given. */
   treatment(name) {
     const implants = this.chosen().find((treatment) => treatment.name === name)?.implants;

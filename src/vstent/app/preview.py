@@ -63,7 +63,9 @@ from vstent.reporting.scene import (
 )
 from vstent.reporting.uncertainty import band_rows, how_sure
 from vstent.study.folder import CACHE
+from vstent.study.keys import stage_name, study_keys
 from vstent.study.stages import ask_for_aneurysm, bands_of, deploy_implant, landing_of, size_of
+from vstent.study.store import Store
 
 Colour = Literal["wall_gap", "coverage", "diameter"]
 """Quantity that colors the wires."""
@@ -148,9 +150,7 @@ class Preview:
         return self._cached(("wall", self.case.state.anatomy, path, *asked, *_before(treatment, implant)), prepare)
 
     def _outer(self, treatment: Treatment, implant: Implant) -> list[Stent]:
-        """Return the deployed devices inside which an implant opens; a DeviceError says that it is coils."""
-        if isinstance(find_design(implant.device), Coil):
-            raise DeviceError(f"{implant.device} are coils: plan them with vstent run on the command line.")
+        """Return the deployed devices inside which an implant opens."""
         return [self.deployment(treatment, _implant(treatment, name)).stent for name in implant.inside]
 
     def _of_implant(self, what: str, treatment: Treatment, implant: Implant, compute: Callable[[], Found]) -> Found:
@@ -162,9 +162,21 @@ class Preview:
 
         def deploy() -> Deployment:
             self._ask(treatment)
+            if isinstance(find_design(implant.device), Coil):
+                return self._stored(treatment, implant)
             return deploy_implant(implant, self.anatomy, self._outer(treatment, implant))
 
         return self._of_implant("deployment", treatment, implant, deploy)
+
+    def _stored(self, treatment: Treatment, implant: Implant) -> Deployment:
+        """Return an implant as the study has deployed it; a DeviceError says that it has not, since coils take long."""
+        settings = replace(self.case.state.settings(), treatments=(treatment,))
+        stage = f"deploy {stage_name(treatment, implant)}"
+        key = study_keys(self.case.state.source, settings)[stage]
+        found = Store(self.case.folder / CACHE).load(stage, key, Deployment)
+        if found is None:
+            raise DeviceError("These coils are not placed yet, which takes up to a minute. Run the step Flow.")
+        return found
 
     def _ask(self, *treatments: Treatment) -> None:
         """Raise VesselError where there is no aneurysm, and a device would get a proposed place nevertheless."""
@@ -379,7 +391,8 @@ class Preview:
             for key in devices:
                 with suppress(VstentError):
                     self._ask(with_device(key))
-                    sizes[key] = size_of(Implant(key, key), self.anatomy).label
+                    if not isinstance(find_design(key), Coil):  # which have a density instead
+                        sizes[key] = size_of(Implant(key, key), self.anatomy).label
             return {"inflow_mL_s": case.inflow_mL_s, "cell_size_mm": default_cell_size_mm(case), "sizes": sizes}
 
         is_without = self.case.state.choices.without_aneurysm

@@ -32,6 +32,7 @@ FIRST: Final = {
         "protrusion_mm",
         "neck_uncovered_fraction",
         "volume_ratio_fraction",
+        "packing_density_fraction",
         "neck_covered_fraction",
         "neck_metal_coverage_fraction",
         "neck_union_coverage_fraction",
@@ -80,6 +81,12 @@ def flow(metrics: dict[str, Any], titles: dict[str, str]) -> list[Sheet]:
     words: Sheet = {"title": "Blood flow", "names": list(titles), "devices": list(titles.values())}
     words |= {"qualities": [one._asdict() | {"mark": one.mark} for one in qualities(metrics, titles)]}
     return [words | {"rows": rows}] if rows else []
+
+
+def ranking(metrics: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the ranked treatments, without those whose flow is not usable."""
+    poor = unusable(metrics)
+    return [row for row in metrics.get("ranking", []) if row["treatment"] not in poor]
 
 
 def uncertainty(metrics: dict[str, Any], titles: dict[str, str]) -> list[dict[str, Any]]:

@@ -151,9 +151,13 @@ class Workspace:
         if kind != "anatomy" and not case.state.choices.treatments:
             raise InputError("No device is chosen. Choose one in the step Treatment.")
         if kind == "rank" and not case.state.choices.ranked:
-            raise InputError("Sizes of baskets are not ranked. Choose a device for arteries in the step Treatment.")
+            raise InputError(
+                "Sizes of baskets and coils are not ranked. Choose a device for arteries in the step Treatment."
+            )
         if kind == "rank" and not case.state.choices.ranked:
-            raise InputError("Sizes of baskets are not ranked. Choose a device for arteries in the step Treatment.")
+            raise InputError(
+                "Sizes of baskets and coils are not ranked. Choose a device for arteries in the step Treatment."
+            )
         steps = statuses(case.state, "", lost_steps(case.folder, case.state))
         if kind == "angiogram" and not (case.state.choices.flow.is_wanted and steps["flow"] == "done"):
             raise InputError("The flow is out of date or not computed, and contrast moves with it. Run the step Flow.")
@@ -291,7 +295,7 @@ class Workspace:
             metrics = json.loads(path.read_text(encoding="utf-8"))
             titles = _titles(metrics, case)
             found |= {"flow": sheets.flow(metrics, titles), "uncertainty": sheets.uncertainty(metrics, titles)}
-            found["ranking"] = metrics.get("ranking", [])
+            found["ranking"] = sheets.ranking(metrics)
         return found
 
     def warm(self) -> None:
