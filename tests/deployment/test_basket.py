@@ -184,6 +184,8 @@ def test_what_makes_no_sense_is_refused_in_a_sentence():
     sac = ball(3.5, 2.2)
     _, basket = read_treatment("silk + web_sl").implants
     with pytest.raises(LandingError, match="WEB SL lies in a sac alone"):
+        deploy("silk", sac, inside=[deploy(BARREL, sac).stent])
+    with pytest.raises(LandingError, match="WEB SL lies in a sac alone"):
         deploy_implant(basket, sac, [deploy("silk", tube(line(30), 2.0)).stent])
 
 
