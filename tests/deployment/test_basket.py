@@ -223,3 +223,12 @@ def test_every_number_of_a_basket_has_a_source_and_a_range_around_its_value(key)
     named = {fact.name for fact in design.facts}
     assert {"wires", "wires_diameter_um", "braid_angle_rad", "exponent", "sizes"} <= named
     assert all(one.low <= one.value <= one.high for one in design.ranges)
+
+
+def test_wires_that_stand_out_of_the_neck_are_metal_in_the_artery():
+    sac = ball(3.5, 2.2)
+    inside, outside = (
+        measure(sac, deploy(BARREL, sac, landing=Landing(at_mm, "proximal")))["metal_in_artery_mm2"]
+        for at_mm in (1.0, -2.0)
+    )
+    assert 0.0 <= inside < 5.0 < outside
