@@ -184,6 +184,8 @@ def test_what_makes_no_sense_is_refused_in_a_sentence():
     sac = ball(3.5, 2.2)
     _, basket = read_treatment("silk + web_sl").implants
     with pytest.raises(LandingError, match="WEB SL lies in a sac alone"):
+        deploy("silk", sac, inside=[deploy(BARREL, sac).stent])
+    with pytest.raises(LandingError, match="WEB SL lies in a sac alone"):
         deploy_implant(basket, sac, [deploy("silk", tube(line(30), 2.0)).stent])
 
 
@@ -221,3 +223,12 @@ def test_every_number_of_a_basket_has_a_source_and_a_range_around_its_value(key)
     named = {fact.name for fact in design.facts}
     assert {"wires", "wires_diameter_um", "braid_angle_rad", "exponent", "sizes"} <= named
     assert all(one.low <= one.value <= one.high for one in design.ranges)
+
+
+def test_wires_that_stand_out_of_the_neck_are_metal_in_the_artery():
+    sac = ball(3.5, 2.2)
+    inside, outside = (
+        measure(sac, deploy(BARREL, sac, landing=Landing(at_mm, "proximal")))["metal_in_artery_mm2"]
+        for at_mm in (1.0, -2.0)
+    )
+    assert 0.0 <= inside < 5.0 < outside

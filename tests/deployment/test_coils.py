@@ -17,7 +17,10 @@ from vstent.devices.treatment import read_treatment
 from vstent.errors import LandingError
 from vstent.geometry.surface import Surface
 from vstent.kernels import rods
-from vstent.study.stages import deploy_implant
+from vstent.study.keys import study_keys
+from vstent.study.settings import Settings
+from vstent.study.stages import deploy_all, deploy_implant
+from vstent.study.store import Store
 
 COILS = find_design("coils")
 WOUND_MM = 0.305
@@ -165,16 +168,42 @@ def test_what_does_not_fit_is_refused():
         ("coils(60%)", "up to 40%"),
         ("coils 3x20", "give a packing density"),
         ("silk(20%)", "no packing density"),
+        ("coils > outlet_1", "leave out its path"),
+        ("web_sls > outlet_1", "leave out its path"),
     ):
         with pytest.raises(LandingError, match=words):
             deploy_implant(read_treatment(text).implants[0], SAC)
     basket = deploy("web_sls", ball(3.5, 1.5)).stent
     with pytest.raises(LandingError, match="do not share a sac"):
         deploy_coils("coils", ball(3.5, 1.5), inside=[basket])
+    with pytest.raises(LandingError, match="two lines of coils, do not share a sac"):
+        deploy_coils("axium", SAC, 0.1, inside=[filled(0.1, seed=2).stent])
     with pytest.raises(LandingError, match="come last"):
         deploy("silk", SAC, inside=[filled(0.1, seed=2).stent])
     with pytest.raises(LandingError, match="no line of coils"):
         deploy_coils("silk", SAC)
+
+
+def test_the_order_of_devices_in_a_sac_is_checked_before_any_is_deployed(tmp_path):
+    stages = []
+    for text, words in (
+        ("coils + enterprise", "Coils come last in a treatment, and only once"),
+        ("coils(3%) + axium(3%)", "Coils come last in a treatment, and only once"),
+        ("web_sls + silk", "WEB SLS lies in a sac alone"),
+        ("silk > outlet_1 | web_sls > outlet_2", "WEB SLS lies in a sac alone"),
+    ):
+        settings = Settings(treatments=(read_treatment(text),), flow=None)
+        store = Store(tmp_path, lambda now: stages.append(now.stage))
+        with pytest.raises(LandingError, match=words):
+            deploy_all(SAC, settings, store, study_keys("", settings))
+    assert not stages
+
+
+def test_more_than_the_density_asked_for_is_explained():
+    deployment = deploy_coils(COILS, SAC, 0.005)
+    assert deployment.stent.density_fraction > 0.015
+    assert "more than the 0.5% asked for, because no shorter coils are made" in deployment.advice
+    assert deployment.outcome == "iteration_limit"
 
 
 def test_solids_are_closed():

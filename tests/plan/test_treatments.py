@@ -56,6 +56,13 @@ def test_several_implants_count_with_all_their_metal_and_their_common_coverage()
     json.dumps(row)
 
 
+def test_a_stent_covers_the_neck_beside_coils_too():
+    kept = treatment(-0.5, -0.5, coverage=0.16)
+    kept["implants"]["coils"] = {"packing_density_fraction": 0.2}
+    (row,) = rank_treatments({"kept": kept})
+    assert (row["neck_coverage_fraction"], row["metal_in_artery_mm2"]) == (0.16, 20.0)
+
+
 def test_a_treatment_without_a_flow_is_left_out():
     assert rank_treatments({"a": {"implants": {}, "jailed_branches": []}}) == []
 

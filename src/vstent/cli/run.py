@@ -85,7 +85,7 @@ def study(
         console.print(treatment_reasons(ranked))
     for sentence in device_sentences(case.metrics):
         console.print(sentence)
-    if settings.uncertainty is not None:
+    if any("uncertainty" in found for found in case.metrics["treatments"].values()):
         console.print(uncertainty_table(case.metrics))
     if injected is not None:
         console.print(angiogram_table(case.metrics))

@@ -274,8 +274,11 @@ def _lies(basket: Basket, room: Room, size: Size, lowest_mm: float) -> tuple[Flo
 
 def measure_basket(anatomy: Anatomy, deployment: Deployment) -> Measures:
     """Measure a basket: compression, what stands out into the artery, gaps to the wall, and wires over the neck."""
-    stent = deployment.stent
-    named: Measures = {"device": stent.design.name, "size": stent.size.label}
+    stent, plane = deployment.stent, anatomy.aneurysms[0].plane or anatomy.aneurysms[0].mean_plane
+    starts_mm, ends_mm, half_mm = stent.pieces_mm
+    is_beyond = (0.5 * (starts_mm + ends_mm) - plane.center_mm) @ plane.normal < 0
+    metal_mm2 = 2 * half_mm[is_beyond] @ curves.lengths(ends_mm - starts_mm)[is_beyond]
+    named: Measures = {"device": stent.design.name, "size": stent.size.label, "metal_in_artery_mm2": float(metal_mm2)}
     return named | _shape(anatomy, stent, deployment.wall_gap_mm) | _over_neck(anatomy, stent)
 
 

@@ -115,8 +115,10 @@ def deploy_coils(
     began, line = time.perf_counter(), find_design(coil) if isinstance(coil, str) else coil
     if not isinstance(line, Coil):
         raise LandingError(f"{line.name} is no line of coils. Choose one, such as coils.")
-    if any(isinstance(stent.design, Basket) for stent in inside):
-        raise LandingError("A basket and coils do not share a sac: give each a treatment of its own.")
+    if any(isinstance(stent.design, Basket | Coil) for stent in inside):
+        raise LandingError(
+            "A basket and coils, or two lines of coils, do not share a sac: give each a treatment of its own."
+        )
     if not anatomy.aneurysms:
         raise LandingError(f"This artery has no sac, and {line.name} lie in one. Choose a device for arteries.")
     wanted = DENSITY_FRACTION if density_fraction is None else density_fraction
@@ -410,7 +412,9 @@ def _advise(coils: Coils, wanted: float, imbalance: float) -> str:
         f"{counted(len(coils.coils), 'coil')} ({names}) with {coils.wire_length_mm / 10:.1f} cm in all fill "
         f"{coils.density_fraction:.1%} of the sac"
     )
-    if abs(coils.density_fraction - wanted) >= 0.01:
+    if coils.density_fraction - wanted >= 0.01:
+        text += f", more than the {100 * wanted:.3g}% asked for, because no shorter coils are made"
+    if wanted - coils.density_fraction >= 0.01:
         text += f"; {wanted:.0%} was not reached, because further coils would kink (choose a lower density)"
     if imbalance >= BALANCED:
         text += f"; their forces are not in balance: {imbalance:.0%} of the contact forces remain"

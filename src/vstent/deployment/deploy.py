@@ -93,9 +93,10 @@ def deploy(  # noqa: PLR0913 one keyword for each thing that can be chosen
         return deploy_coils(design, anatomy, inside=inside)
     if any(isinstance(one, Coils) for one in inside):
         raise LandingError(f"Coils come last in a treatment: give {design.name} before them.")
+    baskets = [one for one in (design, *(stent.design for stent in inside)) if isinstance(one, Basket)]
+    if inside and baskets:
+        raise LandingError(f"{baskets[0].name} lies in a sac alone: give it a treatment of its own.")
     if isinstance(design, Basket):
-        if inside:
-            raise LandingError(f"{design.name} lies in a sac alone: give it a treatment of its own.")
         return deploy_basket(design, anatomy, size, landing or Landing(0.0, "proximal"))
     if isinstance(method, str):
         if method not in METHODS:

@@ -97,9 +97,14 @@ class Implant:
 
     @property
     def is_proposed(self) -> bool:
-        """Whether size and place are left to vstent."""
+        """Whether size, place and packing density are left to vstent."""
+        return self == self.unplaced
+
+    @property
+    def unplaced(self) -> "Implant":
+        """The same implant, with size, place and packing density left to vstent."""
         placing = Placing(self.placing.path, beside=self.placing.beside)
-        return self.diameter_mm is None and self.length_mm is None and self.placing == placing
+        return Implant(self.id, self.device, placing=placing, inside=self.inside)
 
 
 @dataclass(frozen=True)
@@ -135,9 +140,14 @@ class Treatment:
         return tuple(implant.device for implant in self.implants)
 
     @property
+    def plan(self) -> tuple[Implant, ...]:
+        """Its implants with sizes, places and packing densities left to vstent."""
+        return tuple(implant.unplaced for implant in self.implants)
+
+    @property
     def is_proposed(self) -> bool:
-        """Whether sizes and places of all implants are left to vstent."""
-        return all(implant.is_proposed for implant in self.implants)
+        """Whether sizes, places and packing densities of all implants are left to vstent."""
+        return self.implants == self.plan
 
 
 def with_device(
@@ -179,7 +189,7 @@ def read_treatment(text: str) -> Treatment:
         if not found:
             raise InputError(
                 f"{part.strip()!r} is not an implant: write a device, its size, its path and its shift such as "
-                "'silk 4x20 > outlet_2 @-4'"
+                "'silk 4x20 > outlet_2 @-4', or coils with their packing density such as 'coils(25%, seed 3)'"
             )
         device, density, seed, diameter, length, path, shift = found.groups()
         device, path = device.lower(), re.sub(r"\s", "", path or "").removeprefix(ARM_TO_ARM)

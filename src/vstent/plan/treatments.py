@@ -43,8 +43,9 @@ def rank_treatments(treatments: Mapping[str, Any]) -> list[dict[str, Any]]:
         implants = treatment["implants"].values()
         measures = {key: change[ratio] - 1 for key, ratio in FLOWS.items() if ratio in change}
         coverage = treatment.get("together", {}).get("neck_union_coverage_fraction")
-        if coverage is None and len(implants) == 1:
-            coverage = next(iter(implants)).get("neck_metal_coverage_fraction")
+        covering = [one for one in implants if "neck_metal_coverage_fraction" in one]
+        if coverage is None and len(covering) == 1:  # beside coils too
+            coverage = covering[0]["neck_metal_coverage_fraction"]
         if coverage is not None:
             measures["neck_coverage_fraction"] = coverage
         measures["metal_in_artery_mm2"] = sum(one.get("metal_in_artery_mm2", 0.0) for one in implants)

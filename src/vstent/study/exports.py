@@ -100,8 +100,8 @@ def _deployed(path: Path, settings: Settings, store: Store, progress: OnProgress
             words = ", ".join(f"--{name}" for name in given)
             raise InputError(f"{path} is a case folder, whose vessel is exported as it is: leave out {words}")
         source, of_run = finished_run(path)
-        known = {(one.name, one.devices): one for one in of_run.treatments}
-        chosen = [known.get((one.name, one.devices), one) if one.is_proposed else one for one in study.treatments]
+        known = {(one.name, one.plan): one for one in of_run.treatments}
+        chosen = [known.get((one.name, one.plan), one) if one.is_proposed else one for one in study.treatments]
         study = replace(study, input=of_run.input, anatomy=of_run.anatomy, treatments=tuple(chosen))
         store, keys = Store(path / CACHE, progress), study_keys(source, study)
         anatomy = finished_anatomy(path, store, keys)

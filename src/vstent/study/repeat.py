@@ -261,10 +261,10 @@ def merged(out: Path, settings: Settings) -> Settings:
             old = None
         runs = ((old, former.flow), (new, settings.flow))
         has_flow = any(one is not None and one.has_flow and flow is not None for one, flow in runs)
-        if old and new and new.is_proposed and old.devices == new.devices:
+        if old and new and new.is_proposed and old.plan == new.plan:
             new = None  # it leaves sizes and places to the old one
         given = (one and replace(one, has_flow=has_flow) for one in (old, new))
-        treatments.append(_same(out, f"sizes or places of {name}", *given))
+        treatments.append(_same(out, f"sizes, places or densities of {name}", *given))
     flow = _same(out, "flow settings", former.flow, settings.flow)
     return replace(
         former,

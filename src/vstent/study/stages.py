@@ -27,8 +27,8 @@ from vstent.devices.catalogue import find_design, find_sizes
 from vstent.devices.design import Basket, Coil, Size
 from vstent.devices.ranges import how_sure
 from vstent.devices.stent import Coils, Deployment, Landing, Stent
-from vstent.devices.treatment import BARE, Implant
-from vstent.errors import DeviceError, FlowError, InputError, LandingError, ReadError, VesselError, VstentError
+from vstent.devices.treatment import BARE, Implant, Treatment
+from vstent.errors import FlowError, InputError, LandingError, ReadError, VesselError, VstentError
 from vstent.flow.background import BackgroundWork
 from vstent.flow.case import FlowField
 from vstent.flow.ends import ASSUMED
@@ -39,7 +39,7 @@ from vstent.flow.ostium import sac_surfaces
 from vstent.flow.problem import flow_case, vessel_case
 from vstent.flow.settings import OPENFOAM, FlowSettings
 from vstent.flow.simulation import foretell_cost, simulate_case
-from vstent.geometry.vessel import Anatomy, Vessel
+from vstent.geometry.vessel import PARENT, Anatomy, Vessel
 from vstent.io.files import is_surface_file
 from vstent.io.images import read_image
 from vstent.kernels.arrays import Floats
@@ -172,7 +172,7 @@ def deploy_all(
 ) -> tuple[dict[str, dict[str, Deployment]], dict[str, str]]:
     """Return the implants of every treatment, stored or deployed, and the reasons why treatments do not fit, by name.
 
-    DeviceError or LandingError is raised where no treatment can be deployed; the reason is that of the last one.
+    InputError is raised where no treatment can be deployed; the reason is that of the last one.
     VesselError is raised where no aneurysm was found, and none is said to be missing.
     """
     ask_for_aneurysm(anatomy, settings)
@@ -181,6 +181,8 @@ def deploy_all(
     for treatment in settings.treatments:
         implants: dict[str, Deployment] = {}
         try:
+            for implant in treatment.implants:
+                _check_in_sac(implant, treatment)  # at once: coils take minutes
             for implant in treatment.implants:
                 stage = f"deploy {stage_name(treatment, implant)}"
                 deployment = store.find(stage, keys[stage], Deployment)
@@ -191,7 +193,7 @@ def deploy_all(
                     store.defer(stage, keys[stage], deployment)
                 implants[implant.id] = deployment
             deployed[treatment.name] = implants
-        except (DeviceError, LandingError) as error:
+        except InputError as error:  # such as a path that this artery does not have
             if len(treatment.implants) > 1:
                 error.args = (f"{implant.id}, an implant of {treatment.name}: {error}",)
             if len(failures) + 1 == len(settings.treatments):  # the last one too
@@ -203,15 +205,29 @@ def deploy_all(
     return deployed, failures
 
 
+def _check_in_sac(implant: Implant, treatment: Treatment) -> None:
+    """Raise LandingError where a treatment has devices beside a basket, or after coils."""
+    design, is_last = find_design(implant.device), implant is treatment.implants[-1]
+    if isinstance(design, Basket) and len(treatment.implants) > 1:
+        raise LandingError(f"{design.name} lies in a sac alone: give it a treatment of its own.")
+    if isinstance(design, Coil) and not is_last:
+        raise LandingError("Coils come last in a treatment, and only once: give other devices before them.")
+
+
 def deploy_implant(implant: Implant, anatomy: Anatomy, inside: Sequence[Stent] = ()) -> Deployment:
     """Deploy an implant in the given or proposed size and place, inside implants that are there in this order."""
-    anatomy, design = on_path(anatomy, implant.placing.path), find_design(implant.device)
+    design = find_design(implant.device)
+    if isinstance(design, Basket | Coil) and (implant.placing.path != PARENT or implant.placing.beside):
+        raise LandingError(
+            f"{implant.device} is placed in the sac: leave out its path (>), and join it to a stent by + in place of |."
+        )
     if isinstance(design, Coil):
-        if not implant.is_proposed:
+        if not replace(implant, density_fraction=None, seed=0).is_proposed:
             raise LandingError(f"{design.name} have no size and place of their own: give a packing density instead.")
         return deploy_coils(design, anatomy, implant.density_fraction, inside=inside, seed=implant.seed)
     if implant.density_fraction is not None:
         raise LandingError(f"{design.name} has no packing density: only coils have one.")
+    anatomy = on_path(anatomy, implant.placing.path)
     size = size_of(implant, anatomy)
     landing, beside = landing_of(implant, anatomy, size, inside), implant.placing.beside
     return deploy(design, anatomy, size=size, landing=landing, inside=inside, beside=beside)
