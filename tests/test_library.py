@@ -48,6 +48,7 @@ NAMES = (
     "indices",
     "measure",
     "morphology",
+    "on_path",
     "ostium",
     "rank",
     "read_image",
