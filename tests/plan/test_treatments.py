@@ -11,6 +11,7 @@ from vstent.deployment.deploy import deploy
 from vstent.deployment.measure import branches, jailed_branches, measure
 from vstent.devices.catalogue import find_design, find_size
 from vstent.plan.treatments import MEASURES, rank_treatments, treatment_criteria
+from vstent.reporting.ranked import treatment_rows
 
 
 def treatment(velocity, inflow, coverage=0.3, metal=20.0, jailed=None, **other):
@@ -61,6 +62,17 @@ def test_a_stent_covers_the_neck_beside_coils_too():
     kept["implants"]["coils"] = {"packing_density_fraction": 0.2}
     (row,) = rank_treatments({"kept": kept})
     assert (row["neck_coverage_fraction"], row["metal_in_artery_mm2"]) == (0.16, 20.0)
+
+
+def test_a_flow_that_is_not_usable_ranks_nothing():
+    poor = {"quality": {"grade": "not usable"}}
+    best, other = treatment(-0.9, -0.9, **poor), treatment(-0.2, -0.2)
+    first, last = rank_treatments({"best": best, "other": other})
+    assert (first["treatment"], last["is_suitable"], "neck_inflow_change_fraction" in last) == ("other", False, False)
+    assert last["reason"] == "Not ranked: the flow with it is not usable."
+    assert treatment_rows([last]) == [("1", "best", "out", "", "", "", "", "")]
+    rows = rank_treatments({"bare": {"flow": {}} | poor, "other": other})
+    assert [row["reason"] for row in rows] == ["Not ranked: the flow without a device is not usable."]
 
 
 def test_a_treatment_without_a_flow_is_left_out():

@@ -5,6 +5,8 @@ from functools import cache
 from importlib.resources import files
 from typing import Any, Final
 
+from vstent.devices.treatment import BARE
+from vstent.flow.grade import NOT_USABLE
 from vstent.plan.criteria import Criteria, parse
 from vstent.plan.rank import graded
 
@@ -26,6 +28,8 @@ def treatment_criteria() -> Criteria:
 def rank_treatments(treatments: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Rank treatments by their metrics, each with its flow; those without a flow are left out.
 
+    A treatment whose flow, or the flow without a device, is not usable comes last and has no measures.
+
     Parameters
     ----------
     treatments : metrics of the treatments by name, as in ``metrics.json``.
@@ -35,10 +39,16 @@ def rank_treatments(treatments: Mapping[str, Any]) -> list[dict[str, Any]]:
     rows : the best first: name, score from 0 to 1, whether no criterion rules it out, the reasons in words, the
         measures, and the relative change of the flow of every jailed branch by name.
     """
-    rows = []
+    rows: list[dict[str, Any]] = []
+    poor = {name for name, one in treatments.items() if one.get("quality", {}).get("grade") == NOT_USABLE}
     for name, treatment in treatments.items():
         change = treatment.get("change", {})
         if not change:
+            continue
+        if {name, BARE} & poor:
+            reason = f"Not ranked: the flow {'without a device' if BARE in poor else 'with it'} is not usable."
+            told = {"treatment": name, "score": 0.0, "is_suitable": False, "reason": reason}
+            rows.append(told | {"jailed_branches": {}})
             continue
         implants = treatment["implants"].values()
         measures = {key: change[ratio] - 1 for key, ratio in FLOWS.items() if ratio in change}

@@ -21,5 +21,5 @@ def treatment_rows(ranked: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]
         cells = ["" if row.get(key) is None else form.format(row[key]) for _, key, form in COLUMNS]
         jailed = ", ".join(f"{role} {change:+.0%}" for role, change in row["jailed_branches"].items())
         score = f"{100 * row['score']:.0f}" if row["is_suitable"] else "out"
-        rows.append((str(number), row["treatment"], score, *cells, jailed or "none"))
+        rows.append((str(number), row["treatment"], score, *cells, jailed or ("none" if any(cells) else "")))
     return rows
