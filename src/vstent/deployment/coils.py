@@ -330,9 +330,8 @@ def _room(aneurysm: Aneurysm, inside: Sequence[Stent], wound_mm: float) -> Room:
         is_inner = distance_mm < wound_mm
         wire_mm = 0.5 * float(stent.wire_diameter_um.max()) * MM_PER_UM
         points_mm = room.points_mm(is_inner)
-        to_wires_mm = cKDTree(np.concatenate(list(_finely(stent, wire_mm)))).query(points_mm)[
-            0
-        ]  # drawn off the contour
+        wires_mm = np.concatenate(list(_finely(stent, wire_mm)))  # drawn off the contour
+        to_wires_mm = cKDTree(wires_mm).query(points_mm)[0]
         to_stent_mm = np.minimum(stent.contour.closed.signed_distance(points_mm), to_wires_mm)
         distance_mm[is_inner] = np.maximum(distance_mm[is_inner], wire_mm - to_stent_mm)
     return room._replace(distance_mm=distance_mm)
