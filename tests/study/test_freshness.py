@@ -76,7 +76,7 @@ def test_a_changed_line_computes_what_depends_on_it_and_nothing_else(tmp_path: P
     alter(package / "flow" / "simulation.py", '"""Compute one flow: steady', '"""Find one flow: steady')
     alter(package / "deployment" / "deploy.py", "\ndef deploy(", "\n# The only public function.\ndef deploy(")
     alter(package / "study" / "store.py", "self._deferred.clear()", "self._deferred = {}")
-    alter(package / "flow" / "settings.py", '"mean inflow of all inlets"', '"inflow of all inlets"')
+    alter(package / "flow" / "settings.py", '"mean inflow of all inlets, such as', '"inflow of all inlets, such as')
     alter(package / "fields.py", "is not yes or no", "is neither yes nor no")
     assert study(package.parent, tmp_path) == {"computed": [], "told": []}
 
