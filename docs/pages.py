@@ -47,7 +47,7 @@ def table(titles: list[str], rows: list[list[str]], widths: str = "auto") -> str
 def devices() -> str:
     """Return one section a device: drawing, every number with its source and confidence; and a count of these."""
     from vstent.devices.catalogue import baskets, catalogue
-    from vstent.devices.design import Basket, Braid
+    from vstent.devices.design import Basket, Braid, Coil
 
     designs = catalogue() | baskets()
     sure = Counter(fact.confidence for design in designs.values() for fact in design.facts)
@@ -57,14 +57,18 @@ def devices() -> str:
     for design in designs.values():
         text.append(f"{design.name}\n{'-' * len(design.name)}\n\n")
         kind = design.kind.replace("_", "-")
-        wires = (
-            " and ".join(f"{count} wires of {diameter:g} um" for count, diameter in design.wires)
-            if isinstance(design, Braid)
-            else f"{design.n_columns} struts round, {design.strut_width_um:g} um wide"
-        )
-        text.append(f"``{design.key}``, {design.maker}: {kind}, {wires}, {design.angle_rad:.3f} rad to the axis; ")
+        match design:
+            case Coil():
+                wires = f"wire of {design.stock_wire_um:g} um wound to {design.wound_diameter_um:g} um"
+            case Braid():
+                wires = " and ".join(f"{count} wires of {diameter:g} um" for count, diameter in design.wires)
+                wires += f", {design.angle_rad:.3f} rad to the axis"
+            case _:
+                wires = f"{design.n_columns} struts round, {design.strut_width_um:g} um wide"
+                wires += f", {design.angle_rad:.3f} rad to the axis"
+        text.append(f"``{design.key}``, {design.maker}: {kind}, {wires}; ")
         text.append(f"{len(design.sizes)} sizes, {_range(design.sizes)}.{_structure(design)}\n\n")
-        if not isinstance(design, Basket):
+        if not isinstance(design, Basket | Coil):
             text.append(_drawing(design))
         rows = [[f"``{fact.name}``", fact.confidence, _escaped(fact.source)] for fact in design.facts]
         text.append(table(["number", "confidence", "source"], rows, "20 15 65"))
