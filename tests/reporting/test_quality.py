@@ -8,9 +8,10 @@ from pages import Page
 
 from vstent.app import sheets
 from vstent.cli.console import comparison_table
+from vstent.flow.grade import unusable
 from vstent.reporting import definitions
 from vstent.reporting.page import as_html
-from vstent.reporting.quality import qualities, unusable
+from vstent.reporting.quality import qualities
 from vstent.reporting.quantities import compare, format_change
 
 TITLES = {"silk": "Silk", "enterprise": "Enterprise"}

@@ -2,8 +2,9 @@
 
 from typing import Any, Final
 
+from vstent.flow.grade import unusable
 from vstent.reporting.definitions import HEADLINES
-from vstent.reporting.quality import qualities, unusable
+from vstent.reporting.quality import qualities
 from vstent.reporting.quantities import Quantity, compare, flatten
 from vstent.reporting.uncertainty import uncertainty_of
 

@@ -16,10 +16,11 @@ from vstent.devices.fit import Fitted
 from vstent.devices.ranges import MARGIN
 from vstent.devices.treatment import BARE
 from vstent.flow.convergence import POSITIONS, Refinement, Scatter
+from vstent.flow.grade import unusable
 from vstent.geometry.vessel import Opening
 from vstent.plan.rank import Candidate, Ranking
 from vstent.reporting.definitions import INDICES_WITH_OCCLUSION
-from vstent.reporting.quality import qualities, unusable
+from vstent.reporting.quality import qualities
 from vstent.reporting.quantities import ERRORS, flatten, format_change, format_value, opening_rows
 from vstent.reporting.ranked import HEAD, treatment_rows
 from vstent.reporting.uncertainty import ends, how_sure, intervals, number_name

@@ -3,10 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import reduce
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
+from vstent.devices.treatment import BARE
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.domain import mean_diameter_mm
 from vstent.flow.indices import neck_diameter_mm, parent_diameter_mm, residuals
@@ -141,3 +142,10 @@ def _raised_fraction(field: FlowField, sac: Surface, ostium: Surface) -> float:
     counts = (ostium.closest(points_mm)[1] < 0.5 * width_mm) | (sac.closest(points_mm)[1] < sizes_mm)
     volume = (sizes_mm[counts] / field.finest.cell_size_mm) ** 3
     return float(np.average(is_raised[counts], weights=volume)) if counts.any() else 0.0
+
+
+def unusable(metrics: Mapping[str, Any]) -> frozenset[str]:
+    """Return the treatments of a study whose changes count for nothing: their flow or the bare one is not usable."""
+    levels = {name: one["quality"]["grade"] for name, one in metrics.get("treatments", {}).items() if "quality" in one}
+    poor = {name for name, level in levels.items() if level == NOT_USABLE}
+    return frozenset(levels if BARE in poor else poor)

@@ -6,7 +6,7 @@ from importlib.resources import files
 from typing import Any, Final
 
 from vstent.devices.treatment import BARE
-from vstent.flow.grade import NOT_USABLE
+from vstent.flow.grade import unusable
 from vstent.plan.criteria import Criteria, parse
 from vstent.plan.rank import graded
 
@@ -40,12 +40,12 @@ def rank_treatments(treatments: Mapping[str, Any]) -> list[dict[str, Any]]:
         measures, and the relative change of the flow of every jailed branch by name.
     """
     rows: list[dict[str, Any]] = []
-    poor = {name for name, one in treatments.items() if one.get("quality", {}).get("grade") == NOT_USABLE}
+    poor = unusable({"treatments": treatments})
     for name, treatment in treatments.items():
         change = treatment.get("change", {})
         if not change:
             continue
-        if {name, BARE} & poor:
+        if {name, BARE} & poor:  # a treatment may have no grade where the flow without a device is not usable
             reason = f"Not ranked: the flow {'without a device' if BARE in poor else 'with it'} is not usable."
             told = {"treatment": name, "score": 0.0, "is_suitable": False, "reason": reason}
             rows.append(told | {"jailed_branches": {}})

@@ -16,12 +16,13 @@ from vstent.devices.design import Basket
 from vstent.devices.stent import Coils, Deployment
 from vstent.devices.treatment import BARE
 from vstent.flow.ends import ASSUMED
+from vstent.flow.grade import unusable
 from vstent.flow.settings import LATTICE, OPENFOAM
 from vstent.reporting.definitions import DEFINITIONS, HEADLINES, OF_PULSE, Definition
 from vstent.reporting.drawing import Drawing
 from vstent.reporting.figures import Picture
 from vstent.reporting.packing import pack
-from vstent.reporting.quality import OF_GRADES, Quality, qualities, unusable
+from vstent.reporting.quality import OF_GRADES, Quality, qualities
 from vstent.reporting.quantities import Change, Quantity, base_of, compare, flatten, opening_rows, unit_of
 from vstent.reporting.ranked import HEAD, treatment_rows
 from vstent.reporting.scene import Scene, titled, treatment_title

@@ -1,4 +1,4 @@
-"""Grades of the flows as the reports, the page and the terminal state them, and which changes may be shown."""
+"""Grades of the flows as the reports, the page and the terminal state them."""
 
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
@@ -42,7 +42,8 @@ class Quality(NamedTuple):
 
 def qualities(metrics: Mapping[str, Any], titles: Mapping[str, str]) -> list[Quality]:
     """Return the grade of every flow that has one, the flow without a device first; `titles` are of treatments."""
-    graded, found = _graded(metrics), []
+    graded = {name: one["quality"] for name, one in metrics.get("treatments", {}).items() if "quality" in one}
+    found = []
     for name, title in ({BARE: ""} | dict(titles)).items():
         if name in graded:
             one, which = graded[name], f"Grid and convergence {f'with {title}' if title else 'without a device'}"
@@ -56,15 +57,3 @@ def qualities(metrics: Mapping[str, Any], titles: Mapping[str, str]) -> list[Qua
             )
             found.append(Quality(name, which, one["grade"], "; ".join(one["reasons"]), computation))
     return found
-
-
-def unusable(metrics: Mapping[str, Any]) -> frozenset[str]:
-    """Return the treatments whose changes are not shown, because their flow or the bare one is not usable."""
-    graded = _graded(metrics)
-    poor = {name for name, one in graded.items() if one["grade"] == NOT_USABLE}
-    return frozenset(graded if BARE in poor else poor)
-
-
-def _graded(metrics: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the grade of every flow that has one, by treatment."""
-    return {name: one["quality"] for name, one in metrics.get("treatments", {}).items() if "quality" in one}
