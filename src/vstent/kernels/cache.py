@@ -72,10 +72,10 @@ def forget_outdated(sources: Path, *also: Path) -> None:
     files = [file for folder in (sources, *also) for file in sorted(folder.glob("*.py"))]
     digest = sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
     try:
-        if not (place / STAMP).exists() or (place / STAMP).read_text() != digest:
+        if not (place / STAMP).exists() or (place / STAMP).read_text(encoding="utf-8") != digest:
             place.mkdir(parents=True, exist_ok=True)
             for index in place.glob("*.nbi"):
                 index.unlink(missing_ok=True)
-            (place / STAMP).write_text(digest)
+            (place / STAMP).write_text(digest, encoding="utf-8")
     except OSError:
         return  # the folder is not writable, so that nothing is compiled into it

@@ -49,7 +49,7 @@ def code_of(entry: str, without: tuple[str, ...] = ()) -> str:
         todo += imports
     if is_new:
         with suppress(OSError), atomic(cache_folder(PACKAGE) / REMEMBERED) as partial:
-            partial.write_text(json.dumps(memory))
+            partial.write_text(json.dumps(memory), encoding="utf-8")
     return digest(sorted(found.items()))
 
 
@@ -57,7 +57,7 @@ def code_of(entry: str, without: tuple[str, ...] = ()) -> str:
 def _memory() -> dict[str, list[Any]]:
     """Return what is remembered of modules and functions by name: state of the file, digest and imports."""
     with suppress(*UNREADABLE):
-        found = json.loads((cache_folder(PACKAGE) / REMEMBERED).read_text())
+        found = json.loads((cache_folder(PACKAGE) / REMEMBERED).read_text(encoding="utf-8"))
         return {str(name): [state, str(tree), list(imports)] for name, (state, tree, imports) in found.items()}
     return {}
 

@@ -92,7 +92,10 @@ def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
         "inflow": f"{case.inflow_mL_s:.6g}",
         "resisting": RESISTING_NOTE if case.resistances else "",
     }
-    texts = {name: (resources.files(__package__) / "exported" / name).read_text() for name in ("README", *SCRIPTS)}
+    texts = {
+        name: (resources.files(__package__) / "exported" / name).read_text(encoding="utf-8")
+        for name in ("README", *SCRIPTS)
+    }
     files = {
         "system/controlDict": control.control(case, setup, walls),
         "system/fvSchemes": control.schemes(is_steady=is_steady),

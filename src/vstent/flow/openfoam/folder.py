@@ -40,7 +40,7 @@ def prepare(folder: Path, foam: FoamCase) -> None:
     """Write a case to run, unless the folder already contains the same case; delete what another run left."""
     digest = hashlib.sha256("".join(f"{name}\0{text}\0" for name, text in sorted(foam.files.items())).encode())
     key = folder / KEY
-    if key.exists() and key.read_text() == digest.hexdigest():
+    if key.exists() and key.read_text(encoding="utf-8") == digest.hexdigest():
         return
     for path in (found for pattern in PRODUCTS for found in folder.glob(pattern)):
         if path.is_dir():
@@ -83,7 +83,7 @@ def begin_from(folder: Path, start: FlowField) -> None:
             ("p", "scalar", "%.7g", pressure_Pa[:, None] / start.blood.density_kg_m3),
         ):
             rows = "\n".join(row % tuple(value) for value in values)
-            head, _, tail = (part / "0" / name).read_text().partition("internalField")
+            head, _, tail = (part / "0" / name).read_text(encoding="utf-8").partition("internalField")
             rest = BETWEEN_PARTS.sub(r"\1", tail.partition(";")[2])
             inside = f"internalField nonuniform List<{kind}>\n{len(values)}\n(\n{rows}\n)\n;"
             write_text(part / "0" / name, f"{head}{inside}{rest}")
@@ -92,7 +92,7 @@ def begin_from(folder: Path, start: FlowField) -> None:
 def stop_at(folder: Path, end: float) -> None:
     """Set the iteration or time at which the solver stops."""
     path = folder / "system" / "controlDict"
-    write_text(path, re.sub(r"endTime .*;", f"endTime         {end:.9g};", path.read_text()))
+    write_text(path, re.sub(r"endTime .*;", f"endTime         {end:.9g};", path.read_text(encoding="utf-8")))
 
 
 def flow_mL_s(folder: Path, patch: str, time: str) -> float:
@@ -108,7 +108,7 @@ def scale_inflow(folder: Path, inlet: str, factor: float) -> bool:
     """Multiply the mean speed prescribed at an inlet; return False if the inlet prescribes its flow rate instead."""
     paths = list((folder / "constant" / "boundaryData" / inlet).glob("*/U"))
     for path in paths:
-        lines = path.read_text().splitlines()
+        lines = path.read_text(encoding="utf-8").splitlines()
         mean = [factor * float(x) for x in lines[-1].strip("()").split()]
         write_text(path, "\n".join([*lines[:-1], vector(mean), ""]))
     return bool(paths)

@@ -57,7 +57,7 @@ def _joined(parts: list[dict[str, Floats]]) -> dict[str, Floats]:
 def _parsed(path: Path) -> VolumeField:
     """Return a field read from one file."""
     try:
-        text = path.read_text()
+        text = path.read_text(encoding="utf-8")
         inside, _, boundary = text.partition("boundaryField")
         fields = [
             {
