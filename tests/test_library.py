@@ -182,7 +182,9 @@ def test_a_device_is_plugged_in() -> None:
 def test_a_device_that_is_plugged_in_twice_is_refused(distribution: Path) -> None:
     text = (distribution / "tiny_plugin.py").read_text().replace('key = "plugged"', 'key = "silk"')
     (distribution / "tiny_plugin.py").write_text(text)
-    with pytest.raises(DeviceError, match="plug-in tiny names a device that the catalogue already has, silk"):
+    with pytest.raises(
+        DeviceError, match=r"plug-in tiny \(tiny_plugin:devices\) names a device that the catalogue already has, silk"
+    ):
         vstent.catalogue()
 
 

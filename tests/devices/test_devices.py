@@ -423,3 +423,8 @@ def test_the_catalogue_has_the_devices_in_use():
         "silk_vista_baby derivo_2 p48_mw p64_mw fred_x lvis_jr lvis_evo leo_baby enterprise_2 acclino accero"
     )
     assert set(wanted.split()) <= set(catalogue.catalogue())
+
+
+def test_a_printed_entry_is_the_device_itself():
+    for key, design in (catalogue.catalogue() | catalogue.baskets()).items():
+        assert repr(device_schema.parse(catalogue.entry_of(key))) == repr({key: design})

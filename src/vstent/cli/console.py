@@ -232,16 +232,23 @@ def ranking_table(ranking: Ranking, shown: int) -> Table:
     """Return the table of the best candidates of a ranking."""
     measured = {key for candidate in ranking.candidates for key in candidate.measures}
     columns = RANKING_COLUMNS + tuple(column for column in FLOW_COLUMNS if column[1] in measured)
-    table = Table("", "device and size", "shift", "score", *(title for title, _, _ in columns))
+    is_shifted = any(candidate.shift_mm for candidate in ranking.candidates)
+    shift = ["mm shifted"] if is_shifted else []
+    table = Table("", "device and size, mm", *shift, "score", *(title for title, _, _ in columns))
     for number, candidate in _shown(ranking, shown):
         measures = candidate.measures
         cells = ["" if measures.get(key) is None else form.format(measures[key]) for _, key, form in columns]
         if "deployed_length_low_mm" in measures:
             cells[0] += f" ({measures['deployed_length_low_mm']:.1f}-{measures['deployed_length_high_mm']:.1f})"
+        label = f"{candidate.label.removesuffix(' mm')}{' *' if candidate.is_proposed else ''}"
+        shift = [f"{candidate.shift_mm:+g}"] if is_shifted else []
         score = f"{100 * candidate.score:.0f}" if candidate.is_suitable else "out"
-        label = f"{candidate.label}{' *' if candidate.is_proposed else ''}"
-        table.add_row(str(number), label, f"{candidate.shift_mm:+g}", score, *cells)
-    table.columns[1].no_wrap = True
+        table.add_row(str(number), label, *shift, score, *cells)
+    for column in table.columns:  # a title a word a line, so that 80 columns are enough
+        column.max_width = max(5, *(len(word) for word in f"{column.header} x".split()))
+        column.overflow = "fold"
+    table.columns[1].max_width, table.columns[1].no_wrap = None, True
+    table.columns[3 + is_shifted].max_width = len("(18.1-24.3)")
     table.caption = (
         f"{len(ranking.candidates)} tried, {len(ranking.suitable)} suitable; scores of 100. * is the size that vstent "
         "run proposes. In brackets: 95 % band from the ranges of the device's numbers."

@@ -21,6 +21,10 @@ def add(commands: options.Commands) -> None:
     parser.add_argument("--find", metavar="TEXT", default="", help="list only devices with this in name, maker or use")
     parser.set_defaults(command=_devices)
     commands_of_devices = parser.add_subparsers(metavar="COMMAND")
+    text = "Print the entry of a device: copy it to make one of your own."
+    showing = options.add_command(commands_of_devices, "entry", text, "devices entry silk > mine.toml")
+    showing.add_argument("device", help="key or name of the device")
+    showing.set_defaults(command=_entry)
     text = "Add devices of your own to the catalogue."
     adding = options.add_command(commands_of_devices, "add", text, "devices add mine.toml")
     text = "TOML file in the form of vstent's catalogue.toml: every number with its source"
@@ -66,6 +70,14 @@ def _devices(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _entry(arguments: argparse.Namespace) -> int:
+    """Print the entry of a device; return the exit code."""
+    from vstent.devices.catalogue import entry_of
+
+    print(entry_of(arguments.device))
+    return 0
+
+
 def _add(arguments: argparse.Namespace) -> int:
     """Add the devices of a file to the catalogue and print them; return the exit code."""
     from vstent.cli.console import Console, device_table
@@ -79,7 +91,7 @@ def _fit(arguments: argparse.Namespace) -> int:
     """Fit a device to measurements, write its entry and its picture, and print the numbers; return the exit code."""
     from vstent.cli.console import Console, correlation_table, fit_table
     from vstent.devices.catalogue import find_design
-    from vstent.devices.entry import entry
+    from vstent.devices.entry import entry, key_of_name
     from vstent.devices.fit import fit
     from vstent.devices.measurements import TEMPLATE, read_measurements
     from vstent.devices.schema import parse
@@ -108,6 +120,6 @@ def _fit(arguments: argparse.Namespace) -> int:
     console.print(correlation_table(fitted))
     console.print(
         f"Entry in {arguments.out}, picture in {arguments.out.with_suffix('.png')}. "
-        f"Add it to the catalogue: vstent devices add {arguments.out}"
+        f"`vstent devices add {arguments.out}` adds it to the catalogue; then give --device {key_of_name(name)}."
     )
     return 0

@@ -108,7 +108,7 @@ def add_command(commands: Commands, name: str, text: str, example: str) -> argpa
 
 def add_case(parser: argparse.ArgumentParser) -> None:
     """Add input and case folder."""
-    text = "scan (DICOM folder, NIfTI, NRRD, MHA, VTI, raw) or surface (STL, VTP, VTU, VTK, OBJ, PLY)"
+    text = "scan (DICOM folder, NIfTI, NRRD, MHA, VTI, raw) or surface (STL, VTP, VTU, VTM, VTK, OBJ, PLY)"
     parser.add_argument("input", type=Path, help=text)
     text = "case folder; a folder that exists is continued"
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=text)

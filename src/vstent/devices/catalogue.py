@@ -2,7 +2,7 @@
 
 import difflib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
 
@@ -27,33 +27,50 @@ def catalogue() -> dict[str, Design]:
     PluginError
         A plug-in cannot be loaded.
     """
-    from importlib.resources import files
-
     from vstent.devices.schema import parse  # so that pydantic is loaded only with the catalogue
 
-    designs = parse(files("vstent.devices").joinpath("catalogue.toml").read_text(encoding="utf-8"))
-    for name, entry in plugins.plugins("vstent.devices").items():
-        text = plugins.load("vstent.devices", name, built_in="vstent")()
-        added = parse(text, f"The plug-in {name} ({entry.value})")
-        _check_new(added, designs, f"The plug-in {name}")
-        designs |= added
-    for path in sorted(user_folder().glob("*.toml")):
-        added = parse(_text(path), str(path))
-        _check_new(added, designs, path)
+    designs: dict[str, Design] = {}
+    for text, source in _entries():
+        added = parse(text, source)
+        _check_new(added, designs, source)
         designs |= added
     return designs
+
+
+def _entries() -> Iterator[tuple[str, str]]:
+    """Yield the text of every catalogue of devices for arteries, and where it is from."""
+    yield _own("catalogue"), "The catalogue"
+    for name, entry in plugins.plugins("vstent.devices").items():
+        yield plugins.load("vstent.devices", name, built_in="vstent")(), f"The plug-in {name} ({entry.value})"
+    for path in sorted(user_folder().glob("*.toml")):
+        yield _text(path), str(path)
+
+
+def _own(name: str) -> str:
+    """Return the text of a list of devices of vstent."""
+    from importlib.resources import files
+
+    return files("vstent.devices").joinpath(f"{name}.toml").read_text(encoding="utf-8")
+
+
+def entry_of(name: str) -> str:
+    """Return the entry of a device, as its catalogue has it: TOML, every number with its source and range."""
+    import tomlkit
+
+    key = find_design(name).key
+    for text in (*(text for text, _ in _entries()), _own("baskets"), _own("coils")):
+        for device in tomlkit.parse(text)["device"]:
+            if device["key"] == key:
+                return tomlkit.dumps({"device": [device]})
+    raise AssertionError(key)
 
 
 @cache
 def baskets() -> dict[str, Design]:
     """Read the baskets and the coils for sacs, by their key."""
-    from importlib.resources import files
-
     from vstent.devices.schema import parse
 
-    folder = files("vstent.devices")
-    texts = {name: folder.joinpath(f"{name}.toml").read_text(encoding="utf-8") for name in ("baskets", "coils")}
-    return parse(texts["baskets"], "The list of baskets") | parse(texts["coils"], "The list of coils")
+    return parse(_own("baskets"), "The list of baskets") | parse(_own("coils"), "The list of coils")
 
 
 def user_folder() -> Path:

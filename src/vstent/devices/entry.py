@@ -31,7 +31,7 @@ def entry(fitted: Fitted, like: Design, name: str, *, source: str, has_all_sizes
     has_all_sizes : whether the device is offered in all sizes of the similar one, and not only in the measured sizes.
     """
     writer, design = _Writer(fitted, like, source), fitted.design
-    found: dict[str, Any] = {"key": key_of_name(name), "name": name, "maker": like.maker, "kind": design.kind}
+    found: dict[str, Any] = {"key": key_of_name(name), "name": name, "maker": "not stated", "kind": design.kind}
     if isinstance(design, Braid):
         beside = [strands for strands in design.strands if strands.place == "beside"]
         found["wires"] = [writer.group("wires", number) for number in range(len(design.wires))]

@@ -23,6 +23,7 @@ from vstent.plan.rank import Ranking, order_of
 from vstent.study.crate import NAME as CRATE
 from vstent.study.folder import METRICS, RUN
 from vstent.study.store import UNREADABLE
+from vstent.units import MM_PER_UM
 
 IMPLANT: Final = ("contour.vtp", "wires.vtp", "struts.stl", "struts.3mf")
 """Files of one implant."""
@@ -109,7 +110,9 @@ def write_implant(folder: Path, deployment: Deployment) -> str:
         writers.write_surface(folder / "contour.vtp", stent.contour, {"wall_gap_mm": deployment.wall_gap_mm.ravel()})
     wire_id = np.arange(len(stent.wire_diameter_um), dtype=np.int32)
     of_wire: dict[str, NDArray[Any]] = {"wire_id": wire_id, "diameter_um": stent.wire_diameter_um}
-    writers.write_lines(folder / "wires.vtp", stent.wire_points_mm, stent.wire_starts, cell_data=of_wire)
+    radius_mm = np.repeat(0.5 * MM_PER_UM * stent.wire_diameter_um, np.diff(stent.wire_starts))
+    lines = (stent.wire_points_mm, stent.wire_starts, {"radius_mm": radius_mm}, of_wire)
+    writers.write_lines(folder / "wires.vtp", *lines)
     solid = struts(stent)
     writers.write_stl(folder / "struts.stl", solid)
     write_3mf(folder / "struts.3mf", solid)
