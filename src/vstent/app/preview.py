@@ -25,9 +25,8 @@ from vstent.app.finished import kept_histories, shown_flows
 from vstent.app.scans import LOCK
 from vstent.deployment.basket import room_of
 from vstent.deployment.contour import planes
-from vstent.deployment.coverage import together
 from vstent.deployment.deploy import propose_landing
-from vstent.deployment.measure import measure
+from vstent.deployment.measure import measure, measure_together
 from vstent.deployment.method import laid_inside
 from vstent.deployment.sketch import MeasuredWall, Sketch, measured_wall, sketch
 from vstent.devices.catalogue import find_design
@@ -241,10 +240,10 @@ class Preview:
         """Return the tables of the deployed implants of a treatment."""
         titles = implant_titles(self.deployed(treatment))
         found = [sheets.device(titles[one.id], self._measures(treatment, one)) for one in treatment.implants]
-        stents = [one for one in self.stents(treatment) if not isinstance(one, Coils)]
-        if len(stents) > 1:
-            key = "together", self.case.state.anatomy, treatment.implants
-            measures = self._cached(key, lambda: together(self.anatomy, stents))
+        if len(found) > 1:
+            key, stents = ("together", self.case.state.anatomy, treatment.implants), self.stents(treatment)
+            measured = [self._measures(treatment, one) for one in treatment.implants]
+            measures = self._cached(key, lambda: measure_together(self.anatomy, stents, measured))
             found.append(sheets.device("All devices together", measures))
         return found
 

@@ -292,7 +292,7 @@ class Workspace:
             metrics = json.loads(path.read_text(encoding="utf-8"))
             titles = _titles(metrics, case)
             found |= {"flow": sheets.flow(metrics, titles), "uncertainty": sheets.uncertainty(metrics, titles)}
-            found["ranking"] = sheets.ranking(metrics)
+            found["ranking"] = metrics.get("ranking", [])
         return found
 
     def warm(self) -> None:

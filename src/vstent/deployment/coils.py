@@ -371,7 +371,8 @@ def measure_coils(anatomy: Anatomy, coils: Coils) -> Measures:
     first_mm, last_mm, _ = coils.pieces_mm
     middle_mm, length_mm = 0.5 * (first_mm + last_mm), curves.lengths(last_mm - first_mm)
     plane = aneurysm.plane or aneurysm.mean_plane
-    is_beyond = (middle_mm - plane.center_mm) @ plane.normal < 0
+    height_mm = (middle_mm - plane.center_mm) @ plane.normal
+    is_beyond = height_mm < 0
     radius_mm = bend_radii_mm(coils.wire_points_mm, coils.wire_starts)
     found: Measures = {
         "device": coils.design.name,
@@ -382,6 +383,8 @@ def measure_coils(anatomy: Anatomy, coils: Coils) -> Measures:
         "coil_volume_mm3": coils.volume_mm3,
         "packing_density_fraction": coils.density_fraction,
         "coil_beyond_neck_mm": float(length_mm[is_beyond].sum()),
+        "metal_in_artery_mm2": float(wound_mm * length_mm[is_beyond].sum()),
+        "protrusion_mm": max(0.0, 0.5 * wound_mm - float(height_mm.min())),
         "neck_covered_by_coils_fraction": _covered(aneurysm, coils),
         "median_bend_radius_mm": float(np.median(radius_mm)),
         "min_bend_radius_mm": float(radius_mm.min()),

@@ -19,10 +19,9 @@ from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
 from vstent.deployment.coils import deploy_coils, given_coils
-from vstent.deployment.coverage import together
 from vstent.deployment.deploy import deploy, propose_landing, propose_size
 from vstent.deployment.forks import beyond_mm
-from vstent.deployment.measure import jailed_branches, measure
+from vstent.deployment.measure import jailed_branches, measure, measure_together
 from vstent.devices.catalogue import find_design, find_sizes
 from vstent.devices.design import Basket, Coil, Size
 from vstent.devices.ranges import how_sure
@@ -439,7 +438,8 @@ def measure_treatment(anatomy: Anatomy, deployed: Mapping[str, Deployment]) -> d
         "implants": {id_: measure(anatomy, one) for id_, one in deployed.items()},
         "jailed_branches": list(jailed_branches(anatomy, stents)),
     }
-    return found | ({"together": together(anatomy, stents)} if len(stents) > 1 else {})
+    measured = list(found["implants"].values())
+    return found | {"together": measure_together(anatomy, [one.stent for one in deployed.values()], measured)}
 
 
 def _porosity(deployed: Mapping[str, Deployment], flow: FlowSettings | None) -> float:
