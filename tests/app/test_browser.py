@@ -113,9 +113,11 @@ def test_a_treatment_is_built_reordered_and_taken_apart_by_keys(artery, tmp_path
         page.wait_for_selector(".step.done:nth-child(3)")
         step(page, "Treatment")
         headings = page.locator(".catalogue h3")
-        playwright.expect(headings).to_have_text(["Flow diverters", "Stents for coils", "Baskets for the sac"])
+        playwright.expect(headings).to_have_text(
+            ["Flow diverters", "Stents for coils", "Baskets for the sac", "Coils for the sac"]
+        )
         playwright.expect(page.locator(".chosen b")).to_have_text(["Silk", "Enterprise"])
-        page.get_by_label("Add a device inside Silk").focus()
+        page.get_by_label("Add a device to Silk").focus()
         page.keyboard.type("enter")  # the first stent whose name begins so
         page.keyboard.press("Enter")
         implants = page.locator(".implant > span")
@@ -170,7 +172,7 @@ def test_a_y_is_made_of_two_stents_by_their_paths(tmp_path):
         page.wait_for_selector(".step.done:nth-child(3)")
         step(page, "Treatment")
         page.locator("[data-key=device-silk]").uncheck()
-        page.get_by_label("Add a device inside Enterprise").select_option("enterprise")
+        page.get_by_label("Add a device to Enterprise").select_option("enterprise")
         playwright.expect(page.locator(".implant > span")).to_have_count(2)
         step(page, "Deploy")
         for place, outlet in enumerate(("outlet_1", "outlet_2")):
@@ -181,12 +183,60 @@ def test_a_y_is_made_of_two_stents_by_their_paths(tmp_path):
         (treatment,) = chosen(client)["treatments"]
         assert [one["placing"]["path"] for one in treatment["implants"]] == ["outlet_1", "outlet_2"]
         assert [one["inside"] for one in treatment["implants"]] == [[], ["enterprise"]]
+        step(page, "Treatment")
+        join = page.locator("[data-key^=join-]")
+        join.select_option("|")
+        playwright.expect(page.locator(".chosen b")).to_have_text(["Enterprise | Enterprise"])
+        implants = chosen(client)["treatments"][0]["implants"]
+        assert [one["inside"] for one in implants] == [[], []]
+        assert [one["placing"]["beside"] for one in implants] == [["outlet_2"], ["outlet_1"]]
+        join.select_option("&")
+        playwright.expect(page.locator(".chosen b")).to_have_text(["Enterprise & Enterprise"])
+        assert [one["placing"]["beside"] for one in chosen(client)["treatments"][0]["implants"]] == [[], []]
+        join.select_option("+")
+        playwright.expect(page.locator(".chosen b")).to_have_text(["Enterprise + Enterprise"])
+        assert chosen(client)["treatments"][0]["implants"][1]["inside"] == ["enterprise"]
+        step(page, "Deploy")
+        page.get_by_role("button", name="2. Enterprise").click()
+        page.wait_for_selector(".handle.proximal .knob:visible")
         before = place_of(page, "proximal")
         drag(page, ".handle.proximal .knob", 0, -12)
         assert in_time(page, lambda: abs(place_of(page, "proximal") - before) > 0.1)
         assert in_time(
             page, lambda: chosen(client)["treatments"][0]["implants"][1]["placing"]["position_mm"] is not None
         )
+
+
+@pytest.mark.system
+def test_coils_join_a_stent_and_are_placed_as_densely_as_chosen(artery, tmp_path):
+    with app_case.served(tmp_path / "cases") as client, browsing(client) as page:
+        drop(page, artery)
+        page.wait_for_selector(".step.done:nth-child(3)")
+        step(page, "Treatment")
+        page.locator("[data-key=device-silk]").uncheck()
+        page.get_by_label("Add a device to Enterprise").select_option("coils")
+        playwright.expect(page.locator(".implant > span")).to_have_text(
+            ["1. Enterprise proposed", "2. Platinum coils 25 %"]
+        )
+        playwright.expect(page.get_by_label("Add a device to Enterprise + Platinum coils")).to_have_count(0)
+        step(page, "Deploy")
+        page.get_by_role("button", name="2. Platinum coils").click()
+        slider = page.locator("#field-density")
+        slider.fill("5")
+        assert in_time(page, lambda: chosen(client)["treatments"][0]["implants"][1]["density_fraction"] == 0.05)
+        playwright.expect(page.locator(".advice")).to_contain_text("These coils are not placed yet")
+        page.get_by_role("button", name="Place the coils").click()
+        playwright.expect(page.locator(".advice")).to_contain_text("of the sac", timeout=240 * SECOND)
+        playwright.expect(page.get_by_role("button", name="Place the coils")).to_have_count(0)
+        playwright.expect(page.locator(".sheet .term", has_text="Packing density")).to_have_count(1)
+        page.locator("#field-coil").select_option("2,40")
+        assert in_time(page, lambda: chosen(client)["treatments"][0]["implants"][1]["coils"] == [[2.0, 40.0]])
+        page.locator("#field-seed").fill("3")
+        page.keyboard.press("Enter")
+        assert in_time(page, lambda: chosen(client)["treatments"][0]["implants"][1]["seed"] == 3)
+        playwright.expect(page.get_by_role("button", name="Place the coils")).to_have_count(1)
+        step(page, "Treatment")
+        playwright.expect(page.locator(".implant small").last).to_have_text("2 mm × 4 cm, seed 3")
 
 
 @pytest.mark.system

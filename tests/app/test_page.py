@@ -501,7 +501,9 @@ def test_coils_are_shown_as_the_study_has_placed_them(client, case, workspace):
     anatomy, treatment = anatomy_of(client, case, workspace), read_treatment("coils(4%)")
     chosen = asdict(treatment)
     assert choose(client, case, treatments=[chosen]).status_code == 200
-    refused = client.post(f"{case}/deployment", json=wanted(chosen))
+    told, raw = app_case.opened(client.post(f"{case}/deployment", json=wanted(chosen)))
+    assert (told["is_placed"], told["measures"], wires_of(told, raw, "coils")) == (False, [], [])
+    refused = client.get(f"{case}/plan.pdf")
     assert (refused.status_code, "These coils are not placed yet" in refused.json()["detail"]) == (422, True)
     design, sac = find_design("coils"), anatomy.aneurysms[0].sac
     turn = np.linspace(0.0, 2 * np.pi, 50)
@@ -515,7 +517,7 @@ def test_coils_are_shown_as_the_study_has_placed_them(client, case, workspace):
     folder = workspace / case.rpartition("/")[2]
     stored.Store(folder / CACHE).save("deploy coils", key, placed)
     told, raw = app_case.opened(client.post(f"{case}/deployment", json=wanted(chosen)))
-    assert (told["is_coils"], told["advice"]) == (True, "One loop.")
+    assert (told["is_coils"], told["is_placed"], told["advice"]) == (True, True, "One loop.")
     np.testing.assert_allclose(wires_of(told, raw, "coils")[0], loop_mm, atol=2e-3)
     assert client.get(f"{case}/proposed").json()["sizes"] == {}
     choose(client, case, treatments=[SILK])

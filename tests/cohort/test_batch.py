@@ -253,7 +253,7 @@ BAD_LISTS = {
     "no voxels": ("input,shape\na.raw,10 0 10\n", "column shape: 0 is out of range: give 1 to 100000"),
     "a unit of fields": ("input,units\na.stl,furlong\n", "column units: 'furlong' is not one of m, cm, mm"),
     "a flag that is neither": ("input,gpu\na.stl,maybe\n", "column gpu: 'maybe' is not yes or no"),
-    "a treatment of nothing": ("input,treatment\na.stl,+\n", "column treatment: '' is not an implant"),
+    "a treatment of nothing": ("input,treatment\na.stl,+\n", "column treatment: '+' lacks a device before or after +"),
     "a neck that is nowhere": ("input,neck\na.stl,neck.csv\n", "list.csv: "),
     "a range of nothing": ("input,vary-landing\na.stl,2\n", "list.csv: --vary-landing needs --uncertainty N"),
     "an unknown engine": ("input,engine,no-flow\na.stl,steam,no\n", "There is no 'steam'"),

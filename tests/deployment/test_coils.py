@@ -14,7 +14,7 @@ from vstent.deployment.struts import struts
 from vstent.devices.catalogue import find_design, find_size
 from vstent.devices.stent import Landing
 from vstent.devices.treatment import read_treatment
-from vstent.errors import LandingError
+from vstent.errors import InputError, LandingError
 from vstent.geometry.surface import Surface
 from vstent.kernels import rods
 from vstent.study.keys import study_keys
@@ -163,11 +163,35 @@ def test_treatments_state_density_and_seed():
     assert read_treatment("coils").implants[0].density_fraction is None
 
 
+def test_treatments_name_their_coils_one_by_one():
+    implants = read_treatment("enterprise + target(6 mm x 20 cm, 3x80 mm,2 x 1.5cm, seed 4)").implants
+    assert implants[1].coils == ((6.0, 200.0), (3.0, 80.0), (2.0, 15.0))
+    assert (implants[1].density_fraction, implants[1].seed, implants[1].is_proposed) == (None, 4, False)
+    for text in ("coils(25%, 6 x 20 cm)", "coils(6 x 20)", "coils(seed 3)", "coils()", "coils(6 x 20 cm 3 x 8 cm)"):
+        with pytest.raises(InputError, match="is not an implant"):
+            read_treatment(text)
+    for text in ("silk +", "| silk > outlet_1", "name ="):
+        with pytest.raises(InputError, match="lacks a device"):
+            read_treatment(text)
+
+
+def test_given_coils_are_placed_in_their_order_with_their_loops_and_lengths():
+    done = deploy_implant(read_treatment("coils(4.5 mm x 3 cm, 2 x 1.5 cm)").implants[0], SAC)
+    assert [one.coil_label for one in done.stent.coils] == ["4.5 mm x 3 cm", "2 mm x 1.5 cm"]
+    assert done.stent.wire_length_mm == pytest.approx(45, abs=WOUND_MM)
+    assert (done.outcome, "2 coils (4.5 mm x 3 cm, 2 mm x 1.5 cm)" in done.advice) == ("terminated", True)
+    assert measure_coils(SAC, done.stent)["size"] == "4.5 mm x 4.5 cm"
+
+
 def test_what_does_not_fit_is_refused():
     for text, words in (
         ("coils(60%)", "up to 40%"),
-        ("coils 3x20", "give a packing density"),
-        ("silk(20%)", "no packing density"),
+        ("coils 3x20", "give a packing density, or loops x length"),
+        ("coils(1 mm x 4 cm)", "have loops of 2 to 25 mm"),
+        ("target(6 mm x 80 cm)", "have a length of 10 to 500 mm"),
+        ("coils(6 mm x 50 cm)", "cannot fill 56% of a sac"),
+        ("silk(20%)", "neither a packing density nor a list of coils"),
+        ("silk(3 x 4 cm)", "neither a packing density nor a list of coils"),
         ("coils > outlet_1", "leave out its path"),
         ("web_sls > outlet_1", "leave out its path"),
     ):

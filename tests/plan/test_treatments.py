@@ -5,10 +5,11 @@ from types import SimpleNamespace
 
 import pytest
 from forks import arm, fork
+from tubes import line, tube, with_neck
 
 from vstent.cli import main
 from vstent.deployment.deploy import deploy
-from vstent.deployment.measure import branches, jailed_branches, measure
+from vstent.deployment.measure import branches, jailed_branches, measure, measure_together
 from vstent.devices.catalogue import find_design, find_size
 from vstent.plan.treatments import MEASURES, rank_treatments, treatment_criteria
 from vstent.reporting.ranked import treatment_rows
@@ -18,8 +19,8 @@ def treatment(velocity, inflow, coverage=0.3, metal=20.0, jailed=None, **other):
     """The metrics of a treatment with these changes of its flow."""
     change = {"mean_sac_velocity_m_s_ratio": 1 + velocity, "neck_inflow_mL_s_ratio": 1 + inflow}
     change |= {f"{role}_flow_mL_s_ratio": 1 + lost for role, lost in (jailed or {}).items()}
-    implant = {"neck_metal_coverage_fraction": coverage, "metal_in_artery_mm2": metal}
-    return {"implants": {"a": implant}, "change": change, "jailed_branches": list(jailed or {})} | other
+    told = {"implants": {"a": {"metal_in_artery_mm2": metal}}, "change": change, "jailed_branches": list(jailed or {})}
+    return told | {"together": {"neck_union_coverage_fraction": coverage}} | other
 
 
 def test_every_criterion_has_a_measure_a_source_and_words():
@@ -57,11 +58,32 @@ def test_several_implants_count_with_all_their_metal_and_their_common_coverage()
     json.dumps(row)
 
 
-def test_a_stent_covers_the_neck_beside_coils_too():
-    kept = treatment(-0.5, -0.5, coverage=0.16)
-    kept["implants"]["coils"] = {"packing_density_fraction": 0.2}
-    (row,) = rank_treatments({"kept": kept})
-    assert (row["neck_coverage_fraction"], row["metal_in_artery_mm2"]) == (0.16, 20.0)
+def test_wires_over_the_neck_are_those_of_all_devices_in_artery_and_sac():
+    artery = with_neck(tube(line(50), 1.9), 22, 28)
+    stent = deploy("enterprise", artery)
+    alone = measure_together(artery, [stent.stent], [measure(artery, stent)])["neck_union_coverage_fraction"]
+    assert alone == pytest.approx(
+        measure(artery, stent)["neck_metal_coverage_fraction"], rel=0.05
+    )  # it closes the neck
+    coils = {"neck_covered_by_coils_fraction": 0.5}
+    both = measure_together(artery, [stent.stent], [measure(artery, stent), coils])
+    assert both == {"neck_union_coverage_fraction": pytest.approx(1 - 0.5 * (1 - alone))}
+    basket = {"neck_metal_coverage_fraction": 0.6, "neck_uncovered_fraction": 0.25}
+    assert measure_together(artery, [], [basket]) == {"neck_union_coverage_fraction": pytest.approx(0.45)}
+
+
+def test_the_device_that_fits_worst_counts_with_its_gap_and_with_what_stands_out():
+    loose = treatment(-0.7, -0.7)
+    loose["implants"]["b"] = {"mean_wall_gap_mm": 0.55, "protrusion_mm": 0.2}
+    loose["implants"]["a"] |= {"mean_wall_gap_mm": 0.02, "protrusion_mm": 2.0}
+    out = treatment(-0.7, -0.7)
+    out["implants"]["a"] |= {"protrusion_mm": 3.2}
+    first, last = rank_treatments({"out": out, "loose": loose})
+    assert (first["mean_wall_gap_mm"], first["protrusion_mm"]) == (0.55, 2.0)
+    assert "stands out 2.0 mm from the sac into the artery" in first["reason"]
+    assert "mean gap of 0.55 mm between wall and the device that fits worst" in first["reason"]
+    assert last["reason"] == "Ruled out: stands out 3.2 mm from the sac into the artery."
+    assert treatment_rows([first])[0][-3:-1] == ("0.55 mm", "2.0 mm")
 
 
 def test_a_flow_that_is_not_usable_ranks_nothing():
@@ -70,7 +92,7 @@ def test_a_flow_that_is_not_usable_ranks_nothing():
     first, last = rank_treatments({"best": best, "other": other})
     assert (first["treatment"], last["is_suitable"], "neck_inflow_change_fraction" in last) == ("other", False, False)
     assert last["reason"] == "Not ranked: the flow with it is not usable."
-    assert treatment_rows([last]) == [("1", "best", "out", "", "", "", "", "")]
+    assert treatment_rows([last]) == [("1", "best", "none", *7 * ("",))]
     rows = rank_treatments({"bare": {"flow": {}} | poor, "other": other})
     assert [row["reason"] for row in rows] == ["Not ranked: the flow without a device is not usable."]
 

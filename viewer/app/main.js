@@ -454,7 +454,7 @@ class Page {
     const { treatment, implant } = this;
     if (!treatment || this.asksForAneurysm) return;
     this.picture.moved = (event) => this.deploying.look(this.axis.under(event, null));
-    const key = JSON.stringify([treatment, implant.id, this.colour, this.view.anatomy]);
+    const key = JSON.stringify([treatment, implant.id, this.colour, this.view.anatomy, this.view.job?.kind === "place"]);
     if (this.shownTreatment !== key || !this.measures[treatment.name]) {
       this.shownTreatment = key;
       this.deploying.show(treatment.name, implant.id);
@@ -517,7 +517,7 @@ class Page {
     }
     if (this.isComparing) parts.push(head("Compared"), plainSheet(this.ranking.comparing.sheets(), this.isWhole));
     else if (["device", "deploy"].includes(this.step)) {
-      const isFirst = (one) => one === this.treatment && this.names.isBasket(one.implants[0].device); // others differ in their rows
+      const isFirst = (one) => one === this.treatment && this.names.isFor(one.implants[0].device, "basket"); // others differ in their rows
       const sheets = [...this.view.choices.treatments].sort((a, b) => isFirst(b) - isFirst(a)).flatMap(({ name }) => this.measures[name] || []);
       const [alike, others] = [true, false].map((isAlike) => sheets.filter(({ rows }) => (rows[0].key === sheets[0].rows[0].key) === isAlike));
       if (sheets.length) parts.push(head("Deployed"), plainSheet(alike, this.isWhole));
@@ -538,6 +538,10 @@ class Page {
       const range = { key: "length_range", name: "Deployed length, for the artery's diameters", meaning, source: "", cells: [`${low} to ${high}\u202fmm`], is_first: false };
       this.measures[manifest.treatment] = manifest.measures.map((sheet) => ({ ...sheet, rows: low && (sheet.title === manifest.title || manifest.measures.length === 1) ? [...sheet.rows, range] : sheet.rows }));
       this.advice = manifest.advice;
+      const missing = manifest.is_placed ? null : manifest.treatment; // whose coils are not placed yet
+      const isNew = missing !== this.missing;
+      this.missing = missing;
+      if (isNew) this.render();
       this.renderNumbers();
       this.portrait.take(`${manifest.treatment} ${JSON.stringify(manifest.ends_mm)}`);
       this.panel.querySelector(".advice")?.replaceChildren(manifest.advice);
@@ -608,7 +612,7 @@ class Page {
   moved(name, id, mm) {
     return (choices) => {
       const implant = choices.treatments.find((one) => one.name === name).implants.find((one) => one.id === id);
-      return implantWith(name, id, placedAt(implant, mm, this.names.isBasket(implant.device)))(choices);
+      return implantWith(name, id, placedAt(implant, mm, this.names.isFor(implant.device, "basket")))(choices);
     };
   }
 

@@ -56,7 +56,7 @@ function cell(words, title, value, change, sense = "") {
 /** Treatments by their score, the best first, with the reasons. */
 export function rankedSheet(ranked, named) {
   const row = ({ treatment, score, is_suitable, reason }, i) =>
-    make("li", { className: is_suitable ? "good" : "fair" }, [make("b", {}, [`${i + 1}. ${named(treatment)}: ${is_suitable ? `${(100 * score).toFixed(0)} of 100` : "ruled out"}`]), make("small", {}, [reason])]);
+    make("li", { className: is_suitable ? "good" : "fair" }, [make("b", {}, [`${i + 1}. ${named(treatment)}: ${is_suitable ? `${(100 * score).toFixed(0)} of 100` : reason.startsWith("Not ranked") ? "not ranked" : "ruled out"}`]), make("small", {}, [reason])]);
   return [make("h2", {}, ["Treatments ranked"]), make("ul", { className: "qualities" }, ranked.map(row))];
 }
 

@@ -1,9 +1,10 @@
 // The left side: what each step is, what can be chosen in it, and its one main button.
 import { button, make } from "../src/dom.js";
 import { bandWords, placeWords } from "./numbers.js";
-import { isNested, isOfDevice, isPlaced, nested, withDevice } from "./treatments.js";
+import { isOfDevice, isPlaced, JOINS, joined, signOf, withDevice } from "./treatments.js";
 
 const MOST_IMPLANTS = 3;
+const DENSITY = 0.25; // packing density of coils where none is chosen
 
 /** Position of an opening, in the form of a study's settings. */
 export const placeOf = ({ center_mm }) => center_mm.map((x) => Number(x.toFixed(2)));
@@ -159,7 +160,7 @@ export const panels = {
     const { job, choices, has_ranking } = page.view;
     if (page.asksForAneurysm) return [...title("Treatment", "Which devices and sizes suit this artery."), question(page)];
     const chosen = choices.treatments;
-    const parts = [...title("Treatment", "Choose up to three treatments to compare: one device, or several, each inside those before it."), ...earlier(page)];
+    const parts = [...title("Treatment", "Choose up to three treatments to compare: one device, or several."), ...earlier(page)];
     const designOf = (treatment) => isOfDevice(treatment) && page.catalogue.find(({ key }) => key === treatment.name);
     const rows = (treatment) => (designOf(treatment) ? deviceRows(page, designOf(treatment), treatment) : treatmentRows(page, treatment));
     if (chosen.length) parts.push(make("div", { className: "devices chosen" }, chosen.flatMap(rows)));
@@ -175,13 +176,13 @@ export const panels = {
   deploy(page) {
     const { treatment, implant } = page;
     if (page.asksForAneurysm) return [...title("Deploy", "A device in the artery."), question(page)];
-    const isBasket = implant && page.names.isBasket(implant.device);
-    const lead = isBasket ? "Drag the lower end up into the sac or down. A basket that the sac compresses becomes taller, because the wires cannot stretch." : "Drag either end along the artery. The deployed length follows, because the wires cannot stretch.";
-    const isStudys = implant && !isBasket && !page.names.isStent(implant.device);
-    const parts = [...title("Deploy", isStudys ? "The coils as the study has placed them." : lead), ...earlier(page)];
+    const [isBasket, isCoils] = ["basket", "coils"].map((use) => implant && page.names.isFor(implant.device, use));
+    const lead = isCoils ? "Coils enter the sac one after the other, and lie outside the stents. Placing them takes about a minute." : isBasket ? "Drag the lower end up into the sac or down. A basket that the sac compresses becomes taller, because the wires cannot stretch." : "Drag either end along the artery. The deployed length follows, because the wires cannot stretch.";
+    const parts = [...title("Deploy", lead), ...earlier(page)];
     if (!treatment) return [...parts, make("p", { className: "note" }, ["Choose a treatment first."]), next(page, "device", "← Treatment")];
     const isHere = (told) => told?.treatment === treatment.name && told.implant === implant.id;
-    parts.push(...shownTabs(page), ...sizes(page));
+    parts.push(...shownTabs(page), ...(isCoils ? packing(page) : sizes(page)));
+    if (page.missing === treatment.name && !page.view.job) parts.push(main("Place the coils", () => page.start("place"), !page.view.has_anatomy));
     const colour = "Colour of the wires";
     parts.push(
       make("div", { className: "place" }, isHere(page.place) ? placeWords(page.place, isHere(page.bands) ? page.bands : null, page.anatomy.neck) : []),
@@ -361,7 +362,7 @@ function treatmentTick(page, key, treatment, isChosen) {
 }
 
 /** What devices are for, as the catalogue names it, and the heading above them. */
-const USES = { "flow diverter": "Flow diverters", "stent for coils": "Stents for coils", basket: "Baskets for the sac" };
+const USES = { "flow diverter": "Flow diverters", "stent for coils": "Stents for coils", basket: "Baskets for the sac", coils: "Coils for the sac" };
 
 /** The devices that are not chosen yet, by what they are for, and a box that searches them by name, maker and use. */
 function catalogueParts(page) {
@@ -373,11 +374,18 @@ function catalogueParts(page) {
   return [find, make("div", { className: "devices catalogue", tabIndex: 0, role: "region", ariaLabel: "Devices" }, rows.length ? rows : [make("p", { className: "hint" }, ["No device has this in its name, maker or use."])])];
 }
 
-const sizeWords = ({ diameter_mm, length_mm }) => (diameter_mm ? `${diameter_mm} × ${length_mm} mm` : "proposed");
+const percent = (fraction) => `${Number((100 * (fraction ?? DENSITY)).toFixed(1))} %`;
+const coilWords = ([loops_mm, length_mm]) => `${loops_mm} mm × ${length_mm / 10} cm`;
+
+/** The size of an implant, in words: of coils their packing density, or the sizes of those that are given. */
+function sizeWords(page, { device, diameter_mm, length_mm, density_fraction, coils, seed }) {
+  if (!page.names.isFor(device, "coils")) return diameter_mm ? `${diameter_mm} × ${length_mm} mm` : "proposed";
+  return [coils?.length ? coils.map(coilWords).join(", ") : percent(density_fraction), ...(seed ? [`seed ${seed}`] : [])].join(", ");
+}
 
 /** Put other implants in place of those of a treatment. */
-function rebuild(page, treatment, implants) {
-  const built = nested(implants);
+function rebuild(page, treatment, implants, sign = signOf(treatment)) {
+  const built = joined(implants, sign);
   const isThere = page.view.choices.treatments.some(({ name }) => name === built.name && name !== treatment.name);
   if (isThere) page.tell(`${page.names.treatment(built.name)} is already in the list.`);
   else page.choose(({ treatments }) => ({ treatments: treatments.map((one) => (one.name === treatment.name ? built : one)) }));
@@ -385,21 +393,36 @@ function rebuild(page, treatment, implants) {
 }
 
 /** Whether devices of a treatment can be added, moved and removed. */
-const canBuild = (page, treatment) => isNested(treatment) && treatment.implants.every(({ device }) => page.names.isStent(device));
+const canBuild = (page, treatment) => signOf(treatment) && treatment.implants.every(({ device }) => page.names.isStent(device));
 
-/** A list of the stents that can be added inside a treatment. */
+/** The outlets of the artery by name. */
+const outletsOf = (page) => (page.anatomy?.openings ?? []).map(({ role }) => role).filter((role) => role.startsWith("outlet"));
+
+/** How the stents of a treatment are joined, where the artery divides. */
+function joining(page, treatment) {
+  const { implants } = treatment;
+  const outlets = outletsOf(page);
+  if (!canBuild(page, treatment) || implants.length < 2 || outlets.length < implants.length) return [];
+  const change = (sign) => {
+    const isApart = sign !== "|" || new Set(implants.map(({ placing }) => placing.path)).size === implants.length;
+    rebuild(page, treatment, isApart ? implants : implants.map((implant, i) => ({ ...implant, placing: { path: outlets[i] } })), sign);
+  };
+  return [select(`join-${treatment.name}`, "Deployed", signOf(treatment), Object.entries(JOINS).map(([sign, [words]]) => [sign, words]), change)];
+}
+
+/** A list of the devices that can be added to a treatment: stents, and at last coils. */
 function adding(page, treatment) {
   const { implants } = treatment;
   if (!canBuild(page, treatment) || implants.length >= MOST_IMPLANTS) return [];
-  const options = page.catalogue.filter(({ use }) => use !== "basket").map(({ key, name }) => make("option", { value: key }, [name]));
+  const options = page.catalogue.filter(({ use }) => use !== "basket" && (use !== "coils" || signOf(treatment) === "+")).map(({ key, name }) => make("option", { value: key }, [name]));
   const add = () => rebuild(page, treatment, [...implants, ...withDevice(box.value).implants.map((implant) => ({ ...implant, placing: {} }))]);
   let isKeyed = false; // by arrow keys and letters each device on the way is selected: then Enter adds
   const onKeyDown = ({ key }) => {
     isKeyed = true;
     if (key === "Enter" && box.value) add();
   };
-  const words = `Add a device inside ${page.names.treatment(treatment.name)}`;
-  const first = make("option", { value: "" }, ["+ Add a device inside"]);
+  const words = `Add a device to ${page.names.treatment(treatment.name)}`;
+  const first = make("option", { value: "" }, ["+ Add a device"]);
   const handlers = { onChange: () => isKeyed || add(), onKeyDown, onPointerDown: () => (isKeyed = false) };
   const box = make("select", { className: "inside", title: "By keys: select, then Enter", ariaLabel: words, data: { key: `inside-${treatment.name}` }, ...handlers }, [first, ...options]);
   return [make("div", { className: "implant" }, [box])];
@@ -408,27 +431,29 @@ function adding(page, treatment) {
 /** A treatment of several devices, or one as the study that the case was opened from had it: its devices in order. */
 function treatmentRows(page, treatment) {
   const { name, implants } = treatment;
-  const canChange = canBuild(page, treatment) && implants.length > 1;
+  const isCoils = ({ device }) => page.names.isFor(device, "coils");
+  const canChange = signOf(treatment) && implants.length > 1;
   const swapped = (i, j) => implants.map((implant, k) => implants[k === i ? j : k === j ? i : k]);
   const act = (sign, words, id, changed) => button(sign, () => rebuild(page, treatment, changed), { className: "icon", title: `${words} ${page.names.implant(name, id)}`, ariaLabel: `${words} ${page.names.implant(name, id)}` });
   const row = ({ id, ...implant }, i) => {
     const acts = [
-      ...(i ? [act("↑", "Deploy earlier:", id, swapped(i - 1, i))] : []),
-      ...(i < implants.length - 1 ? [act("↓", "Deploy later:", id, swapped(i, i + 1))] : []),
+      ...(i && !isCoils(implant) ? [act("↑", "Deploy earlier:", id, swapped(i - 1, i))] : []),
+      ...(i < implants.length - 1 && !isCoils(implants[i + 1]) ? [act("↓", "Deploy later:", id, swapped(i, i + 1))] : []),
       act("×", "Remove", id, implants.filter((_, k) => k !== i)),
     ];
-    return make("div", { className: "implant" }, [make("span", {}, [page.names.implant(name, id), " ", make("small", {}, [sizeWords(implant)])]), ...(canChange ? acts : [])]);
+    return make("div", { className: "implant" }, [make("span", {}, [page.names.implant(name, id), " ", make("small", {}, [sizeWords(page, implant)])]), ...(canChange ? acts : [])]);
   };
   const head = make("label", { className: "device", title: `Treatment ${name}` }, [treatmentTick(page, name, treatment, true), make("span", {}, [make("b", {}, [page.names.treatment(name)])])]);
-  return [head, ...implants.map(row), ...adding(page, treatment)];
+  return [head, ...implants.map(row), ...joining(page, treatment), ...adding(page, treatment)];
 }
 
 /** A device of the catalogue: with its size where a treatment is of this device alone, else with how many of its numbers are cited. */
 function deviceRows(page, design, treatment) {
   const device = treatment?.implants[0];
   const sure = `${design.n_cited} of ${design.n_facts} numbers are cited from a source`;
-  const size = device?.diameter_mm ? sizeWords(device) : page.proposed?.sizes[design.key]?.replace(" x ", " × ") ?? "";
-  const mark = device ? [size, ...(device.diameter_mm ? [] : [make("small", {}, ["proposed"])])] : [make("small", { className: "cited" }, [`${design.n_cited}/${design.n_facts} cited`])];
+  const isCoils = design.use === "coils";
+  const size = device?.diameter_mm || isCoils ? sizeWords(page, device ?? { device: design.key }) : page.proposed?.sizes[design.key]?.replace(" x ", " × ") ?? "";
+  const mark = device ? [size, ...(device.diameter_mm || isCoils ? [] : [make("small", {}, ["proposed"])])] : [make("small", { className: "cited" }, [`${design.n_cited}/${design.n_facts} cited`])];
   const row = make("label", { className: "device", title: `${design.maker}, ${design.sizes.length} sizes; ${sure}` }, [
     treatmentTick(page, design.key, treatment ?? withDevice(design.key), Boolean(treatment)),
     make("span", {}, [make("b", {}, [design.name]), make("small", {}, [design.maker])]),
@@ -451,7 +476,6 @@ function shownTabs(page) {
 function sizes(page) {
   const { treatment, implant: device } = page;
   const design = page.catalogue.find(({ key }) => key === device.device);
-  if (!design) return []; // coils
   const isHere = page.place?.treatment === treatment.name && page.place.implant === device.id;
   const proposed = isHere ? page.place.size.match(/([\d.]+) x ([\d.]+)/) : null;
   const now = [device.diameter_mm ?? Number(proposed?.[1] ?? 0), device.length_mm ?? Number(proposed?.[2] ?? 0)];
@@ -462,20 +486,48 @@ function sizes(page) {
     const [diameter_mm, length_mm] = text ? text.split(",").map(Number) : [null, null];
     page.changeImplant(treatment.name, device.id, { diameter_mm, length_mm });
   };
-  const again = page.names.isBasket(device.device) ? "Put it on the neck again" : "Center it on the neck again";
+  const again = page.names.isFor(device.device, "basket") ? "Put it on the neck again" : "Center it on the neck again";
   const recenter = link(again, () => page.choose(page.moved(treatment.name, device.id, null)));
   return [select("size", "Size", value, [["", words], ...options], change), ...(page.names.isStent(device.device) ? paths(page) : []), ...(isPlaced(device) ? [recenter] : [])];
+}
+
+/** How coils fill the sac: their packing density, or the coils that are given one by one; and the seed. */
+function packing(page) {
+  const { treatment, implant } = page;
+  const { coils, density_fraction, seed } = implant;
+  const design = page.catalogue.find(({ key }) => key === implant.device);
+  const change = (changes) => page.changeImplant(treatment.name, implant.id, changes);
+  const shown = make("b", {}, [percent(density_fraction)]);
+  let timer;
+  const onInput = () => (shown.textContent = `${slider.value} %`);
+  const onChange = () => {
+    clearTimeout(timer);
+    timer = setTimeout(() => change({ density_fraction: slider.value / 100 }), 250);
+  };
+  const slider = make("input", { type: "range", min: 5, max: 40, step: 1, value: 100 * (density_fraction ?? DENSITY), id: "field-density", data: { key: "density" }, onInput, onChange });
+  const density = make("label", { className: "slider", htmlFor: "field-density" }, [make("span", {}, ["Packing density ", shown]), slider]);
+  const row = (size, i) => make("div", { className: "given" }, [make("span", {}, [`${i + 1}. ${coilWords(size)}`]), link("Remove", () => change({ coils: coils.filter((_, k) => k !== i) }))]);
+  const sizesOf = design.sizes.map((size) => [size.join(","), coilWords(size)]);
+  const add = (text) => change({ density_fraction: null, coils: [...coils, text.split(",").map(Number)] });
+  return [
+    ...(coils.length ? coils.map(row) : [density]),
+    select("coil", coils.length ? "Then" : "Or coil by coil", "", [["", "+ Add a coil"], ...sizesOf], add),
+    number("seed", "Seed", "", seed, (value) => change({ seed: value ?? 0 }), { min: 0, step: 1 }),
+  ];
 }
 
 /** The path on which the stent in view lies, where the artery divides. */
 function paths(page) {
   const { treatment, implant } = page;
-  const outlets = (page.anatomy?.openings ?? []).map(({ role }) => role).filter((role) => role.startsWith("outlet"));
-  if (outlets.length < 2 || implant.placing.beside.length) return [];
+  const outlets = outletsOf(page);
+  if (outlets.length < 2) return [];
   const pairs = outlets.flatMap((one, i) => outlets.slice(i + 1).map((other) => [one, other]));
   const spoken = (role) => role.replace("_", " ");
-  const options = [["parent", "parent artery"], ...outlets.map((role) => [role, `inlet to ${spoken(role)}`]), ...pairs.map((pair) => [pair.join(">"), pair.map(spoken).join(" to ")])];
-  const change = (path) => page.changeImplant(treatment.name, implant.id, { placing: { path } });
+  const { beside } = implant.placing; // the paths of stents side by side with it
+  const ways = [["parent", "parent artery"], ...outlets.map((role) => [role, `inlet to ${spoken(role)}`]), ...pairs.map((pair) => [pair.join(">"), pair.map(spoken).join(" to ")])];
+  const options = beside.length ? ways.filter(([role]) => outlets.includes(role) && !beside.includes(role)) : ways;
+  const moved = (path) => treatment.implants.map((one) => (one === implant ? { ...one, placing: { path } } : one));
+  const change = (path) => (beside.length ? rebuild(page, treatment, moved(path)) : page.changeImplant(treatment.name, implant.id, { placing: { path } }));
   return [select("path", "Path", implant.placing.path, options, change)];
 }
 

@@ -8,19 +8,27 @@ export function withDevice(device, { diameter_mm = null, length_mm = null } = {}
 /** Whether a treatment is that of a single device, as the list of devices offers it. */
 export const isOfDevice = ({ name, implants }) => implants.length === 1 && implants[0].device === name;
 
-/** Whether a treatment is of stents in the parent artery, each inside those before it: its order can be changed. */
-export const isNested = ({ implants }) =>
-  implants.every(({ placing, inside }, i) => inside.length === i && (placing.path ?? "parent") === "parent" && !placing.beside?.length);
+/** How implants can be joined: by the sign of the command line, with what stands between them in a name. */
+export const JOINS = { "+": ["each inside those before it", "+"], "|": ["side by side (kissing)", "_beside_"], "&": ["as if each were alone", "_over_"] };
 
-/** A treatment of implants in the order of their deployment, each inside those before it, named as on the command line. */
-export function nested(implants) {
+/** The sign that joins the implants of a treatment; nothing where each is joined in its own way. */
+export function signOf({ implants }) {
+  if (implants.every(({ inside }, i) => inside.length === i)) return "+";
+  if (implants.some(({ inside }) => inside.length)) return null;
+  return implants.every(({ placing }) => placing.beside.length === implants.length - 1) ? "|" : implants.every(({ placing }) => !placing.beside.length) ? "&" : null;
+}
+
+/** A treatment of implants in the order of their deployment, joined by a sign, named as on the command line. */
+export function joined(implants, sign = "+") {
   const named = [];
   for (const implant of implants) {
     let id = implant.device;
     for (let n = 2; named.some((other) => other.id === id); n++) id = `${implant.device}_${n}`;
-    named.push({ ...implant, id, inside: named.map((other) => other.id) });
+    named.push({ ...implant, id, inside: sign === "+" ? named.map((other) => other.id) : [] });
   }
-  return { name: named.map(({ id }) => id).join("+"), implants: named };
+  const paths = named.map(({ placing }) => placing?.path);
+  for (const implant of named) implant.placing = { ...implant.placing, beside: sign === "|" ? paths.filter((path) => path !== implant.placing.path) : [] };
+  return { name: named.map(({ id }) => id).join(JOINS[sign][1]), implants: named };
 }
 
 /** What changes of one implant make of the choices. */
@@ -49,20 +57,21 @@ export class Names {
     return this.catalogue.find((design) => design.key === key)?.name || key;
   }
 
-  isBasket(key) {
-    return this.catalogue.find((design) => design.key === key)?.use === "basket";
+  /** Whether a device is for a use, as the catalogue names it: ``basket``, ``coils``. */
+  isFor(key, use) {
+    return this.catalogue.find((design) => design.key === key)?.use === use;
   }
 
-  /** Whether a device lies in an artery: it is neither a basket nor coils, which the catalogue of the page has not. */
+  /** Whether a device lies in an artery, and not in a sac. */
   isStent(key) {
-    return this.catalogue.some((design) => design.key === key && design.use !== "basket");
+    return !this.isFor(key, "basket") && !this.isFor(key, "coils");
   }
 
   /** A treatment by its name: its devices, or the name that it was given. */
   treatment(name) {
     const implants = this.chosen().find((treatment) => treatment.name === name)?.implants;
-    const isNamed = implants && name !== implants.map(({ id }) => id).join("+");
-    return implants && !isNamed ? implants.map(({ device }) => this.device(device)).join(" + ") : this.device(name);
+    const sign = implants && Object.keys(JOINS).find((key) => name === implants.map(({ id }) => id).join(JOINS[key][1]));
+    return sign ? implants.map(({ device }) => this.device(device)).join(` ${sign} `) : this.device(name);
   }
 
   /** An implant of a treatment: its device, with its place in the order where there are several. */

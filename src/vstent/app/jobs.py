@@ -17,11 +17,12 @@ from vstent.children import environment
 KINDS: Final = {
     "anatomy": ("image", "vessel", "sac"),
     "rank": ("device",),
+    "place": ("deploy",),
     "flow": ("device", "deploy", "flow", "report"),
     "angiogram": ("flow", "report"),
 }
 """Steps that each kind of job completes."""
-FIRST: Final = {"anatomy": "image", "rank": "device", "flow": "flow", "angiogram": "flow"}
+FIRST: Final = {"anatomy": "image", "rank": "device", "place": "deploy", "flow": "flow", "angiogram": "flow"}
 """Step that each kind of job shows before its first progress message."""
 STAGES: Final = {
     "scan": "image",

@@ -25,9 +25,8 @@ from vstent.app.finished import kept_histories, shown_flows
 from vstent.app.scans import LOCK
 from vstent.deployment.basket import room_of
 from vstent.deployment.contour import planes
-from vstent.deployment.coverage import together
 from vstent.deployment.deploy import propose_landing
-from vstent.deployment.measure import measure
+from vstent.deployment.measure import measure, measure_together
 from vstent.deployment.method import laid_inside
 from vstent.deployment.sketch import MeasuredWall, Sketch, measured_wall, sketch
 from vstent.devices.catalogue import find_design
@@ -79,6 +78,8 @@ BESIDE_MM: Final = 8.0
 """Length of artery on each side of the neck that the profile view shows, in mm."""
 NEIGHBOURS: Final = 3
 """Number of consecutive wire points that have the color of one node, the nearest to the first of them."""
+NOT_PLACED: Final = "These coils are not placed yet. Place them in the step Deploy; it takes about a minute."
+"""Why coils are not drawn."""
 BELOW_MM: Final = 3.0
 """Largest depth of a basket's lower end below the middle of the neck to which it can be dragged, in mm."""
 HEIGHT_STEP_MM: Final = 0.05
@@ -169,14 +170,26 @@ class Preview:
         return self._of_implant("deployment", treatment, implant, deploy)
 
     def _stored(self, treatment: Treatment, implant: Implant) -> Deployment:
-        """Return an implant as the study has deployed it; a DeviceError says that it has not, since coils take long."""
+        """Return coils as a job has placed them; a DeviceError says that none has, since the page does not wait."""
         settings = replace(self.case.state.settings(), treatments=(treatment,))
         stage = f"deploy {stage_name(treatment, implant)}"
         key = study_keys(self.case.state.source, settings)[stage]
         found = Store(self.case.folder / CACHE).load(stage, key, Deployment)
         if found is None:
-            raise DeviceError("These coils are not placed yet, which takes up to a minute. Run the step Flow.")
+            raise DeviceError(NOT_PLACED)
         return found
+
+    def placed(self, treatment: Treatment) -> Treatment:
+        """Return a treatment without the coils that are not placed yet."""
+        there = []
+        for implant in treatment.implants:
+            try:
+                if isinstance(find_design(implant.device), Coil):
+                    self.deployment(treatment, implant)
+                there.append(implant)
+            except DeviceError:
+                continue
+        return replace(treatment, implants=tuple(there))
 
     def _ask(self, *treatments: Treatment) -> None:
         """Raise VesselError where there is no aneurysm, and a device would get a proposed place nevertheless."""
@@ -227,10 +240,10 @@ class Preview:
         """Return the tables of the deployed implants of a treatment."""
         titles = implant_titles(self.deployed(treatment))
         found = [sheets.device(titles[one.id], self._measures(treatment, one)) for one in treatment.implants]
-        stents = [one for one in self.stents(treatment) if not isinstance(one, Coils)]
-        if len(stents) > 1:
-            key = "together", self.case.state.anatomy, treatment.implants
-            measures = self._cached(key, lambda: together(self.anatomy, stents))
+        if len(found) > 1:
+            key, stents = ("together", self.case.state.anatomy, treatment.implants), self.stents(treatment)
+            measured = [self._measures(treatment, one) for one in treatment.implants]
+            measures = self._cached(key, lambda: measure_together(self.anatomy, stents, measured))
             found.append(sheets.device("All devices together", measures))
         return found
 
@@ -295,7 +308,7 @@ class Preview:
         A path other than the parent artery comes with it.
         """
         if isinstance(stent, Coils):
-            return {"device": stent.design.key, "size": stent.size.label, "is_coils": True}
+            return {"device": stent.design.key, "size": stent.size.coil_label, "is_coils": True}
         ends = (stent.proximal_abscissa_mm, stent.distal_abscissa_mm)
         told = {
             "device": stent.design.key,
@@ -415,7 +428,7 @@ class Preview:
         with LOCK:
             pane, followers = treatment.name, {implant}
             drawn: dict[str, Sketch | Deployment] = {}
-            for one in treatment.implants:
+            for one in self.placed(treatment).implants:
                 is_moved, is_sketched = one.id == implant, _is_sketched(treatment, one)
                 if is_moved and is_sketched:
                     drawn[one.id] = self._sketch(self._wall(treatment, one), _landed(one, landing))
@@ -437,10 +450,20 @@ class Preview:
     def deployment_message(self, treatment: Treatment, implant: str, colour: Colour) -> bytes:
         """Return a deployed treatment with its expansion and its metrics, and the place of one of its implants."""
         with LOCK:
-            chosen, deployed = _implant(treatment, implant), self.deployed(treatment)
+            chosen, there = _implant(treatment, implant), self.placed(treatment)
+            deployed = self.deployed(there)
+            self._show(self.stents(there))
+            layers = self._drawn(treatment.name, there, colour)
+            told: dict[str, Any] = {"treatment": treatment.name, "implant": implant}
+            told |= {
+                "title": treatment_title(deployed),
+                "measures": self._sheets(there),
+                "is_placed": there == treatment,
+            }
+            if implant not in deployed:
+                told |= {"device": chosen.device, "is_coils": True, "advice": NOT_PLACED}
+                return message(layers, scales_of(layers, self.anatomy), **told)
             found, stent = deployed[implant], deployed[implant].stent
-            self._show(self.stents(treatment))
-            layers = self._drawn(treatment.name, treatment, colour)
             sketched: Sketch | None = None
             if _is_sketched(treatment, chosen):
                 landing = landing_of(chosen, on_path(self.anatomy, chosen.placing.path), stent.size)
@@ -449,12 +472,9 @@ class Preview:
             return message(
                 layers,
                 scales_of(layers, self.anatomy),
-                treatment=treatment.name,
-                implant=implant,
+                **told,
                 **self._place(chosen, stent, sketched),
-                title=treatment_title(deployed),
                 advice=found.advice,
-                measures=self._sheets(treatment),
             )
 
     def comparison_message(self, treatments: Sequence[Treatment], colour: Colour) -> bytes:
@@ -525,9 +545,10 @@ class Preview:
                 "lumen": _section(anatomy.vessel.lumen, center, frame),
                 "landing": _section(anatomy.parent.landing_surface, center, frame),
             }
-            if name is None:
+            deployed: dict[str, Deployment] = {} if name is None else self.deployed(self.placed(self.choice(name)))
+            rings: list[Any] = []
+            if not deployed:
                 return shown
-            deployed, rings = self.deployed(self.choice(name)), []
             rows = {key: _row_at(one.stent, at_mm) for key, one in deployed.items()}
             for key, row in rows.items():
                 if row is not None:

@@ -311,7 +311,7 @@ def _add_jobs(api: APIRouter, work: Workspace, of_case: Any) -> None:
     """Add the routes of jobs and results."""
 
     @api.post("/api/cases/{case_id}/jobs/{kind}", status_code=202, summary="Start a long stage")
-    def start(kind: Literal["anatomy", "rank", "flow", "angiogram"], case: Case = of_case) -> dict[str, Any]:
+    def start(kind: Literal["anatomy", "rank", "place", "flow", "angiogram"], case: Case = of_case) -> dict[str, Any]:
         work.start(case, kind)
         return work.view(case)
 

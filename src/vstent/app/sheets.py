@@ -84,12 +84,6 @@ def flow(metrics: dict[str, Any], titles: dict[str, str]) -> list[Sheet]:
     return [words | {"rows": rows}] if rows else []
 
 
-def ranking(metrics: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the ranked treatments, without those whose flow is not usable."""
-    poor = unusable(metrics)
-    return [row for row in metrics.get("ranking", []) if row["treatment"] not in poor]
-
-
 def uncertainty(metrics: dict[str, Any], titles: dict[str, str]) -> list[dict[str, Any]]:
     """Return the uncertainty intervals of every treatment that has some, in the order of their titles by name."""
     ordered = {"treatments": {name: metrics["treatments"][name] for name in titles}}

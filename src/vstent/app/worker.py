@@ -55,6 +55,13 @@ def find_anatomy(case: Case) -> None:
     ask_for_aneurysm(anatomy, settings)
 
 
+def place_implants(case: Case) -> None:
+    """Deploy the chosen treatments with their coils, and store them for the page and the flow."""
+    from vstent.study.pipeline import deploy_treatments
+
+    deploy_treatments(case.input, case.folder, case.state.settings(), progress, replaces=True)
+
+
 def _anatomy_key(case: Case) -> str:
     """Return the key of the anatomy of a case."""
     return str(anatomy_keys(hash_of(case.input), case.state.settings())[ANATOMY])
@@ -92,6 +99,7 @@ def rank(case: Case) -> None:
 JOBS: Final[dict[str, Callable[[Case], None]]] = {
     "anatomy": find_anatomy,
     "rank": rank,
+    "place": place_implants,
     "flow": compute,
     "angiogram": carry_contrast,
 }

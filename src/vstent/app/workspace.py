@@ -141,7 +141,7 @@ class Workspace:
             self._scans.pop(case.id, None)
 
     def start(self, case: Case, kind: str) -> None:
-        """Start a job of a kind: anatomy, rank, flow or angiogram.
+        """Start a job of a kind: anatomy, rank, place, flow or angiogram.
 
         Raises ReadError: there is no scan or surface, or it was moved.
         Raises InputError: no device is chosen, or the flow of an angiogram is not up to date.
@@ -150,10 +150,6 @@ class Workspace:
             raise ReadError(f"The scan of {case.state.name} has been moved from {case.input}. Put it back there.")
         if kind != "anatomy" and not case.state.choices.treatments:
             raise InputError("No device is chosen. Choose one in the step Treatment.")
-        if kind == "rank" and not case.state.choices.ranked:
-            raise InputError(
-                "Sizes of baskets and coils are not ranked. Choose a device for arteries in the step Treatment."
-            )
         if kind == "rank" and not case.state.choices.ranked:
             raise InputError(
                 "Sizes of baskets and coils are not ranked. Choose a device for arteries in the step Treatment."
@@ -175,6 +171,7 @@ class Workspace:
         """Mark the steps device and deploy as finished after a deployed treatment was sent to the page."""
         keys = dependencies(case.state)
         is_current = treatment in case.state.choices.treatments and case.state.done.get("sac") == keys["sac"]
+        is_current = is_current and self.preview(case).placed(treatment) == treatment
         chosen = {step: keys[step] for step in ("device", "deploy")}
         if is_current and any(case.state.done.get(step) != key for step, key in chosen.items()):
             case.update(done=case.state.done | chosen)
@@ -263,7 +260,7 @@ class Workspace:
         from vstent.app.outlines import outlines
 
         preview = self.preview(case)
-        stents = [] if treatment is None else preview.stents(preview.choice(treatment))
+        stents = [] if treatment is None else preview.stents(preview.placed(preview.choice(treatment)))
         return outlines(self.scan(case).grid(is_upright=is_upright), preview.anatomy, stents, axis, index)
 
     def input_surface(self, case: Case) -> bytes:
@@ -295,7 +292,7 @@ class Workspace:
             metrics = json.loads(path.read_text(encoding="utf-8"))
             titles = _titles(metrics, case)
             found |= {"flow": sheets.flow(metrics, titles), "uncertainty": sheets.uncertainty(metrics, titles)}
-            found["ranking"] = sheets.ranking(metrics)
+            found["ranking"] = metrics.get("ranking", [])
         return found
 
     def warm(self) -> None:
@@ -352,7 +349,7 @@ def begin_upload(case: Case, name: str) -> Path:
 
 
 def devices() -> list[dict[str, Any]]:
-    """Return the catalogue with the baskets as the page lists it."""
+    """Return the catalogue with baskets and coils as the page lists it."""
     from vstent.devices.catalogue import baskets, catalogue
 
     return [
@@ -366,7 +363,6 @@ def devices() -> list[dict[str, Any]]:
             "n_facts": len(design.facts),
         }
         for key, design in (catalogue() | baskets()).items()
-        if design.use != "coils"  # which are given by their density, in the text of a treatment
     ]
 
 

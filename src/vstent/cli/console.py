@@ -144,7 +144,7 @@ def comparison_table(metrics: Mapping[str, Any]) -> Table:
         if any(cells):
             table.add_row(title, "", *cells)
     unions = [treatment.get("together", {}).get(NECK_UNION) for treatment in treatments.values()]
-    if any(union is not None for union in unions):
+    if any(len(treatment["implants"]) > 1 for treatment in treatments.values()) and any(unions):
         table.add_row("Metal on the neck, all devices", "", *(_cell(NECK_UNION, union) for union in unions))
     if bare:
         table.add_section()

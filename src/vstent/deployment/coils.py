@@ -78,7 +78,7 @@ class Room(NamedTuple):
 def deploy_coils(
     coil: Coil | str,
     anatomy: Anatomy,
-    density_fraction: float | None = None,
+    filling: float | Sequence[Size] | None = None,
     *,
     inside: Sequence[Stent] = (),
     seed: int = 0,
@@ -92,8 +92,9 @@ def deploy_coils(
         The line of coils, or its key or name in the catalogue.
     anatomy : Anatomy
         The restored artery.
-    density_fraction : float, optional
-        Packing density: volume of the coils over that of the sac; None is 0.25.
+    filling : float or sequence of Size, optional
+        Packing density, volume of the coils over that of the sac, or the sizes of all coils in their order; None is
+        a density of 0.25.
     inside : sequence of Stent, optional
         Devices that are already in the artery; the coils stay outside them.
     seed : int, optional
@@ -121,33 +122,35 @@ def deploy_coils(
         )
     if not anatomy.aneurysms:
         raise LandingError(f"This artery has no sac, and {line.name} lie in one. Choose a device for arteries.")
-    wanted = DENSITY_FRACTION if density_fraction is None else density_fraction
+    aneurysm, wound_mm = anatomy.aneurysms[0], line.wound_diameter_um * MM_PER_UM
+    sac_mm3, given = abs(aneurysm.sac.volume_mm3), filling if isinstance(filling, Sequence) else ()
+    of_given = sum(size.length_mm for size in given) * np.pi / 4 * wound_mm**2 / sac_mm3
+    wanted = filling if isinstance(filling, int | float) else of_given or DENSITY_FRACTION
     if not 0 < wanted <= DENSEST_FRACTION:
         raise LandingError(
-            f"Coils cannot fill {wanted:.0%} of a sac. Give a packing density up to {DENSEST_FRACTION:.0%}."
+            f"Coils cannot fill {wanted:.0%} of a sac. Give a packing density up to {DENSEST_FRACTION:.0%}, or fewer "
+            "coils."
         )
-    aneurysm, wound_mm = anatomy.aneurysms[0], line.wound_diameter_um * MM_PER_UM
-    sac_mm3 = abs(aneurysm.sac.volume_mm3)
     total_mm = wanted * sac_mm3 / (np.pi / 4 * wound_mm**2)
-    filling = _Filling(line, aneurysm, _room(aneurysm, inside, wound_mm), total_mm, np.random.default_rng(seed))
+    pushed = _Filling(line, aneurysm, _room(aneurysm, inside, wound_mm), total_mm, np.random.default_rng(seed))
     shortest = min(line.sizes, key=lambda size: (size.length_mm, size.diameter_mm))
     sizes: list[Size] = []
     is_full = False
     while not is_full:
-        size = next_size(line, sac_mm3, sizes, total_mm - filling.length_mm)
-        entered_mm = filling.push(size, is_framing=not sizes) if size else 0.0
-        if size and not entered_mm and size is not shortest:
-            size, entered_mm = shortest, filling.push(shortest, is_framing=not sizes)
+        size = next_size(line, sac_mm3, sizes, total_mm - pushed.length_mm, given)
+        entered_mm = pushed.push(size, is_framing=not sizes) if size else 0.0
+        if size and not entered_mm and not given and size is not shortest:
+            size, entered_mm = shortest, pushed.push(shortest, is_framing=not sizes)
         is_full = entered_mm == 0.0
         if size and entered_mm:
-            is_whole = entered_mm > size.length_mm - filling.wound_mm
+            is_whole = entered_mm > size.length_mm - pushed.wound_mm
             sizes.append(size if is_whole else replace(size, length_mm=round(entered_mm, 1)))
         if progress:
-            progress(len(sizes), min(filling.length_mm / total_mm, 1.0))
-    imbalance = filling.settle()
+            progress(len(sizes), min(pushed.length_mm / total_mm, 1.0))
+    imbalance = pushed.settle()
     if not sizes:
         raise LandingError(f"No coil of {line.name} enters this sac: it is too small for loops of 2 mm.")
-    points_mm, starts = filling.wires()
+    points_mm, starts = pushed.wires()
     diameters_um = np.full(len(sizes), line.wound_diameter_um)
     whole = Size(sizes[0].diameter_mm, float(sum(one.length_mm for one in sizes)), sizes[0].free_diameter_mm)
     flat = np.zeros((0, 0, 3)), np.zeros(0), points_mm, starts, diameters_um
@@ -165,12 +168,32 @@ def deploy_coils(
     )
 
 
-def next_size(coil: Coil, sac_mm3: float, before: Sequence[Size], left_mm: float) -> Size | None:
+def given_coils(line: Coil, sizes_mm: Sequence[tuple[float, float]]) -> list[Size]:
+    """Return coils of a line by loops and length (c, 2), which need not be sizes that the catalogue lists."""
+    margin_mm = line.sizes[0].free_diameter_mm - line.sizes[0].diameter_mm
+    for given_mm, made, what in zip(
+        zip(*sizes_mm, strict=True),
+        ({one.diameter_mm for one in line.sizes}, {one.length_mm for one in line.sizes}),
+        ("loops of {:g} to {:g} mm", "a length of {:g} to {:g} mm"),
+        strict=True,
+    ):
+        if not min(made) <= min(given_mm) <= max(given_mm) <= max(made):
+            raise LandingError(f"Coils of {line.name} have {what.format(min(made), max(made))}: change the sizes.")
+    return [Size(loops_mm, length_mm, loops_mm + margin_mm) for loops_mm, length_mm in sizes_mm]
+
+
+def next_size(
+    coil: Coil, sac_mm3: float, before: Sequence[Size], left_mm: float, given: Sequence[Size] = ()
+) -> Size | None:
     """Return the next coil for a sac in which some already are, and a length is missing; None where it is full.
+
+    Where coils are given, it is the next of them.
 
     The loops of the framing coil are as wide as the sac, taken as a sphere, or as the largest that are narrower. Those
     of every further coil are narrower than those of the coil before. Each is as long as is made and missing.
     """
+    if given:
+        return given[len(before)] if len(before) < len(given) else None
     widths_mm = sorted({size.diameter_mm for size in coil.sizes})
     sac_mm = (6 * sac_mm3 / np.pi) ** (1 / 3)
     if before:
@@ -348,17 +371,20 @@ def measure_coils(anatomy: Anatomy, coils: Coils) -> Measures:
     first_mm, last_mm, _ = coils.pieces_mm
     middle_mm, length_mm = 0.5 * (first_mm + last_mm), curves.lengths(last_mm - first_mm)
     plane = aneurysm.plane or aneurysm.mean_plane
-    is_beyond = (middle_mm - plane.center_mm) @ plane.normal < 0
+    height_mm = (middle_mm - plane.center_mm) @ plane.normal
+    is_beyond = height_mm < 0
     radius_mm = bend_radii_mm(coils.wire_points_mm, coils.wire_starts)
     found: Measures = {
         "device": coils.design.name,
-        "size": coils.size.label,
-        "coils": ", ".join(one.label for one in coils.coils),
+        "size": coils.size.coil_label,
+        "coils": ", ".join(one.coil_label for one in coils.coils),
         "coils_count": float(len(coils.coils)),
         "coil_length_mm": coils.wire_length_mm,
         "coil_volume_mm3": coils.volume_mm3,
         "packing_density_fraction": coils.density_fraction,
         "coil_beyond_neck_mm": float(length_mm[is_beyond].sum()),
+        "metal_in_artery_mm2": float(wound_mm * length_mm[is_beyond].sum()),
+        "protrusion_mm": max(0.0, 0.5 * wound_mm - float(height_mm.min())),
         "neck_covered_by_coils_fraction": _covered(aneurysm, coils),
         "median_bend_radius_mm": float(np.median(radius_mm)),
         "min_bend_radius_mm": float(radius_mm.min()),
@@ -406,7 +432,7 @@ def _finely(stent: Stent, step_mm: float) -> Iterator[Floats]:
 
 def _advise(coils: Coils, wanted: float, imbalance: float) -> str:
     """Describe how full a sac is, and what was not reached."""
-    names = ", ".join(f"{one.diameter_mm:g} mm x {one.length_mm / 10:.3g} cm" for one in coils.coils)
+    names = ", ".join(one.coil_label for one in coils.coils)
     text = (
         f"{counted(len(coils.coils), 'coil')} ({names}) with {coils.wire_length_mm / 10:.1f} cm in all fill "
         f"{coils.density_fraction:.1%} of the sac"

@@ -20,6 +20,8 @@ NECK_TOLERANCE_MM: Final = 0.02
 """Largest distance between the neck and the landing surface, in mm, since the two have different triangles."""
 ON_PATH_MM: Final = 0.5
 """Distance from the landing surface, in mm, within which wires of a device on another path lie on this one too."""
+UNION: Final = "neck_union_coverage_fraction"
+"""Measure of the metal over the neck: what is under a wire of any device, as a fraction of the whole neck."""
 SAMPLES_PER_QUAD: Final = 8
 """Number of points per direction at which coverage is sampled in every quad of the contour."""
 
@@ -105,12 +107,13 @@ def together(anatomy: Anatomy, stents: Sequence[Stent]) -> Measures:
     Metal over the neck is what is under a wire of any of them, as a fraction of the whole neck. Devices on several
     paths have no common length, and the neck is that on each of these paths.
     """
-    found: Measures = {} if len({stent.path for stent in stents}) > 1 else _lengths_together(stents)
+    is_on_one = len(stents) > 1 == len({stent.path for stent in stents})
+    found: Measures = _lengths_together(stents) if is_on_one else {}
     covered_mm2 = neck_mm2 = 0.0
     for name in dict.fromkeys(stent.path for stent in stents) if anatomy.aneurysms else ():
         covered, areas_mm2 = _neck_under_wires(on_path(anatomy, name), stents)
         covered_mm2, neck_mm2 = covered_mm2 + float(covered @ areas_mm2), neck_mm2 + float(areas_mm2.sum())
-    return found | ({"neck_union_coverage_fraction": covered_mm2 / neck_mm2} if neck_mm2 else {})
+    return found | ({UNION: covered_mm2 / neck_mm2} if neck_mm2 else {})
 
 
 def _lengths_together(stents: Sequence[Stent]) -> Measures:

@@ -10,11 +10,11 @@ from vstent.anatomy.morphology import Measures
 from vstent.anatomy.restore.paths import on_path
 from vstent.deployment.basket import measure_basket
 from vstent.deployment.coils import measure_coils
-from vstent.deployment.coverage import density, quad_areas_mm2
+from vstent.deployment.coverage import UNION, density, quad_areas_mm2, together
 from vstent.deployment.crowns import free_crowns
 from vstent.deployment.crumpling import crumpling_measures
 from vstent.deployment.sizing import APPOSED_GAP_MM, oversizing_fraction
-from vstent.devices.design import Basket, piece_length_mm
+from vstent.devices.design import Basket, Coil, piece_length_mm
 from vstent.devices.formulas import grid
 from vstent.devices.stent import Coils, Deployment, Stent
 from vstent.geometry.vessel import Anatomy
@@ -65,6 +65,22 @@ def measure(anatomy: Anatomy, deployment: Deployment) -> Measures:
             "terminated_fraction": float(deployment.terminated_fraction[-1]),
         }
     )
+
+
+def measure_together(anatomy: Anatomy, stents: Sequence[Stent], measured: Sequence[Measures]) -> Measures:
+    """Measure the devices of a treatment as a whole: `together`, and metal over the neck by all of them.
+
+    Wires of devices in the sac count as unrelated to those of stents, since they lie at random behind them.
+    """
+    in_artery = [stent for stent in stents if not isinstance(stent.design, Basket | Coil)]
+    found = together(anatomy, in_artery) if in_artery else {}
+    left_open = 1.0 - float(found.get(UNION, 0.0))
+    for measures in measured:
+        left_open *= 1.0 - float(measures.get("neck_covered_by_coils_fraction", 0.0))
+        if "neck_uncovered_fraction" in measures:
+            within = 1.0 - float(measures["neck_uncovered_fraction"])
+            left_open *= 1.0 - within * float(measures.get("neck_metal_coverage_fraction", 0.0))
+    return found | ({UNION: 1.0 - left_open} if anatomy.aneurysms else {})
 
 
 def _position(anatomy: Anatomy, stent: Stent) -> Measures:

@@ -84,6 +84,11 @@ class Size:
         """Size as printed on the box."""
         return f"{self.diameter_mm:.2f} x {self.length_mm:g} mm"
 
+    @property
+    def coil_label(self) -> str:
+        """Loops and length of a coil, as printed on the box."""
+        return f"{self.diameter_mm:g} mm x {self.length_mm / 10:.3g} cm"
+
 
 @dataclass(frozen=True)
 class Strands:

@@ -6,6 +6,7 @@ from typing import Final, Literal, get_args
 
 from vstent.errors import InputError
 from vstent.fields import LENGTH, POSITION, setting
+from vstent.units import MM_PER
 
 Anchor = Literal["center", "distal", "proximal"]
 """Point of a device that is placed at the landing position."""
@@ -28,13 +29,15 @@ SIDE_BY_SIDE: Final = "|"
 """Sign between implants of a treatment that lie side by side."""
 AS_IF_ALONE: Final = "&"
 """Sign between implants of a treatment that are deployed as if each were alone."""
-_DENSITY: Final = rf"\(\s*({_NUMBER})\s*%\s*(?:,\s*seed\s+(\d+)\s*)?\)"
-"""Form of the packing density of coils, with a seed."""
+_COIL: Final = rf"{_NUMBER}\s*(?:mm)?\s*x\s*{_NUMBER}\s*(?:cm|mm)"
+"""Form of the size of one coil: loops in mm x length in cm or mm."""
+_FILLING: Final = rf"\(\s*(?:({_NUMBER})\s*%|({_COIL}(?:\s*,\s*{_COIL})*))(?:\s*,\s*seed\s+(\d+))?\s*\)"
+"""Form of the packing density of coils or of their sizes, with a seed."""
 IMPLANT: Final = re.compile(
-    rf"([\w-]+)(?:\s*{_DENSITY})?(?:\s+({_NUMBER})\s*x\s*({_NUMBER}))?(?:\s*((?:(?<=\s)\w+\s*)?>\s*\w+))?"
+    rf"([\w-]+)(?:\s*{_FILLING})?(?:\s+({_NUMBER})\s*x\s*({_NUMBER}))?(?:\s*((?:(?<=\s)\w+\s*)?>\s*\w+))?"
     rf"(?:\s*@\s*([+-]?{_NUMBER}|{FORK}))?"
 )
-"""Form of an implant in the text of a treatment: device, density, diameter x length, > path, @ shift or fork."""
+"""Form of an implant in the text of a treatment: device, coils, diameter x length, > path, @ shift or fork."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +91,9 @@ class Implant:
     inside: tuple[str, ...] = ()
     """Implants that are there before it, by id, in the order of their deployment; it opens inside them."""
     density_fraction: float | None = None
-    """Packing density of coils; None: as proposed."""
+    """Packing density of coils; None: as proposed, or that of the given coils."""
+    coils: tuple[tuple[float, float], ...] = ()
+    """Loops and length of every coil in mm, in their order; none: they are proposed."""
     seed: int = 0
     """Number from which the random choices of coils are drawn."""
 
@@ -170,7 +175,8 @@ def read_treatment(text: str) -> Treatment:
         ``> outlet_2`` from the inlet or ``outlet_1 > outlet_2`` from one arm of a fork to the other, and after ``@`` a
         shift of the proposed place in mm, positive distally, or ``fork``: it begins where its path has left the devices
         before it. Devices joined by ``|`` lie side by side; those joined by ``&`` are deployed as if each were alone.
-        After coils may stand their packing density and a seed, ``coils(25%, seed 3)``. ``NAME=`` before them names the
+        After coils may stand their packing density, or the loops and lengths of all of them, and a seed:
+        ``coils(25%, seed 3)``, ``target(6 mm x 20 cm, 3 mm x 8 cm)``. ``NAME=`` before them names the
         treatment; otherwise its name is made of its devices and paths.
 
     Raises
@@ -186,12 +192,16 @@ def read_treatment(text: str) -> Treatment:
     implants: list[Implant] = []
     for part in devices.split(sign):
         found = IMPLANT.fullmatch(part.strip())
+        if not part.strip():
+            where = f"before or after {sign}" if sign in devices else "after ="
+            raise InputError(f"{text.strip()!r} lacks a device {where}: name it, or leave out the sign")
         if not found:
             raise InputError(
                 f"{part.strip()!r} is not an implant: write a device, its size, its path and its shift such as "
-                "'silk 4x20 > outlet_2 @-4', or coils with their packing density such as 'coils(25%, seed 3)'"
+                "'silk 4x20 > outlet_2 @-4', or coils with their packing density or their sizes such as "
+                "'coils(25%, seed 3)' and 'target(6 mm x 20 cm, 3 mm x 8 cm)'"
             )
-        device, density, seed, diameter, length, path, shift = found.groups()
+        device, density, sizes, seed, diameter, length, path, shift = found.groups()
         device, path = device.lower(), re.sub(r"\s", "", path or "").removeprefix(ARM_TO_ARM)
         first = "_".join([device, *path.split(ARM_TO_ARM)]) if path else device
         ids = (first, *(f"{first}_{number}" for number in range(2, len(implants) + 2)))
@@ -208,6 +218,10 @@ def read_treatment(text: str) -> Treatment:
                 ),
                 tuple(one.id for one in implants) if sign == NESTED else (),
                 float(density) / 100 if density else None,
+                tuple(
+                    (float(loops), float(length) * MM_PER[unit])
+                    for loops, length, unit in re.findall(rf"({_NUMBER})[\sm]*x\s*({_NUMBER})\s*(\w+)", sizes or "")
+                ),
                 int(seed or 0),
             )
         )

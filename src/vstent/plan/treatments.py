@@ -1,10 +1,11 @@
-"""Rank the treatments of a study together: inflow, velocity, metal, and the flow that jailed branches lose."""
+"""Rank the treatments of a study together: inflow, velocity, metal, fit, and the flow that jailed branches lose."""
 
 from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
 from typing import Any, Final
 
+from vstent.deployment.coverage import UNION
 from vstent.devices.treatment import BARE
 from vstent.flow.grade import unusable
 from vstent.plan.criteria import Criteria, parse
@@ -15,7 +16,9 @@ FLOWS: Final = {
     "neck_inflow_change_fraction": "neck_inflow_mL_s_ratio",
 }
 """Measure of a treatment, and the ratio of flows from which it follows."""
-MEASURES: Final = (*FLOWS, "neck_coverage_fraction", "metal_in_artery_mm2", "worst_branch_change_fraction")
+WORST: Final = ("mean_wall_gap_mm", "protrusion_mm")
+"""Measures of fit, of which that of the implant that fits worst counts."""
+MEASURES: Final = (*FLOWS, "neck_coverage_fraction", "metal_in_artery_mm2", "worst_branch_change_fraction", *WORST)
 """Measures for criteria."""
 
 
@@ -52,13 +55,12 @@ def rank_treatments(treatments: Mapping[str, Any]) -> list[dict[str, Any]]:
             continue
         implants = treatment["implants"].values()
         measures = {key: change[ratio] - 1 for key, ratio in FLOWS.items() if ratio in change}
-        coverage = treatment.get("together", {}).get("neck_union_coverage_fraction")
-        covering = [one for one in implants if "neck_metal_coverage_fraction" in one]
-        if coverage is None and len(covering) == 1:  # beside coils too
-            coverage = covering[0]["neck_metal_coverage_fraction"]
-        if coverage is not None:
+        if (coverage := treatment.get("together", {}).get(UNION)) is not None:
             measures["neck_coverage_fraction"] = coverage
         measures["metal_in_artery_mm2"] = sum(one.get("metal_in_artery_mm2", 0.0) for one in implants)
+        for key in WORST:
+            if values := [one[key] for one in implants if key in one]:
+                measures[key] = max(values)
         jailed = {
             role: change[f"{role}_flow_mL_s_ratio"] - 1
             for role in treatment.get("jailed_branches", ())

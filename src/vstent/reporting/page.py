@@ -167,7 +167,7 @@ def contents_of(case: "CaseResult", drawing: Drawing | None = None) -> Contents:
         implants.append(_implant(title, deployment, measured, (name, key), is_repeated=is_repeated))
         told.add(deployment.stent.design.key)
     for name, deployed in case.implants.items():
-        if measured := metrics["treatments"][name].get("together"):
+        if len(deployed) > 1 and (measured := metrics["treatments"][name].get("together")):
             implants.append(_together(f"{treatment_title(deployed)}, together", measured, name))
     return Contents(
         name=case.name,

@@ -126,7 +126,7 @@ def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str,
             "neck_covered_by_coils_fraction": "Part of the neck that they cover",
         }
         cells = [(words, format_value(key, metrics[key])) for key, words in keys.items()]
-        sizes = [(f"Coil {n}, loops x length", one.label) for n, one in enumerate(stent.coils, start=1)]
+        sizes = [(f"Coil {n}, loops x length", one.coil_label) for n, one in enumerate(stent.coils, start=1)]
         return [("Coils", stent.design.name), *cells, *sizes]
     if isinstance(stent.design, Basket):
         keys = {

@@ -8,6 +8,8 @@ COLUMNS: Final = (
     ("sac velocity", "sac_velocity_change_fraction", "{:+.0%}"),
     ("neck covered", "neck_coverage_fraction", "{:.0%}"),
     ("metal in artery", "metal_in_artery_mm2", "{:.0f} mm²"),
+    ("gap to wall", "mean_wall_gap_mm", "{:.2f} mm"),
+    ("stands out", "protrusion_mm", "{:.1f} mm"),
 )
 """Columns of measures: title, key and number format."""
 HEAD: Final = ("", "treatment", "score", *(title for title, _, _ in COLUMNS), "jailed branches")
@@ -20,6 +22,6 @@ def treatment_rows(ranked: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]
     for number, row in enumerate(ranked, start=1):
         cells = ["" if row.get(key) is None else form.format(row[key]) for _, key, form in COLUMNS]
         jailed = ", ".join(f"{role} {change:+.0%}" for role, change in row["jailed_branches"].items())
-        score = f"{100 * row['score']:.0f}" if row["is_suitable"] else "out"
+        score = f"{100 * row['score']:.0f}" if row["is_suitable"] else "out" if any(cells) else "none"
         rows.append((str(number), row["treatment"], score, *cells, jailed or ("none" if any(cells) else "")))
     return rows

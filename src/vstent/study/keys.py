@@ -67,7 +67,7 @@ def implant_keys(anatomy: Key, treatment: Treatment) -> dict[str, Key]:
     for implant in treatment.implants:
         design = replace(find_design(implant.device), facts=(), ranges=())
         given: tuple[Any, ...] = design, implant.diameter_mm, implant.length_mm, implant.placing
-        given += (implant.density_fraction, implant.seed) if isinstance(design, Coil) else ()
+        given += (implant.density_fraction, implant.coils, implant.seed) if isinstance(design, Coil) else ()
         inside = [keys[name] for name in implant.inside]
         keys[implant.id] = key_of("vstent.study.stages:deploy_implant", anatomy, *given, inside)
     return keys

@@ -178,6 +178,14 @@ def restore_vessel(
         return anatomy, measures
 
 
+def deploy_treatments(path: Path, out: Path, settings: Settings, progress: OnProgress, *, replaces: bool) -> None:
+    """Deploy the treatments and store their implants, for a study in the same folder; errors are as in `run`."""
+    with _begun(path, out, settings, progress, replaces) as (store, source):
+        keys = study_keys(source, settings)
+        stages.deploy_all(stages.find_anatomy(path, settings, store, keys), settings, store, keys)
+        _save_deferred(path, out, source, store, [treatment.name for treatment in settings.treatments])
+
+
 def refine_flow(
     path: Path, out: Path, settings: Settings, progress: OnProgress, *, replaces: bool = False
 ) -> Sensitivity:

@@ -18,11 +18,10 @@ from vstent.anatomy.restore.paths import on_path
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
-from vstent.deployment.coils import deploy_coils
-from vstent.deployment.coverage import together
+from vstent.deployment.coils import deploy_coils, given_coils
 from vstent.deployment.deploy import deploy, propose_landing, propose_size
 from vstent.deployment.forks import beyond_mm
-from vstent.deployment.measure import jailed_branches, measure
+from vstent.deployment.measure import jailed_branches, measure, measure_together
 from vstent.devices.catalogue import find_design, find_sizes
 from vstent.devices.design import Basket, Coil, Size
 from vstent.devices.ranges import how_sure
@@ -222,11 +221,15 @@ def deploy_implant(implant: Implant, anatomy: Anatomy, inside: Sequence[Stent] =
             f"{implant.device} is placed in the sac: leave out its path (>), and join it to a stent by + in place of |."
         )
     if isinstance(design, Coil):
-        if not replace(implant, density_fraction=None, seed=0).is_proposed:
-            raise LandingError(f"{design.name} have no size and place of their own: give a packing density instead.")
-        return deploy_coils(design, anatomy, implant.density_fraction, inside=inside, seed=implant.seed)
-    if implant.density_fraction is not None:
-        raise LandingError(f"{design.name} has no packing density: only coils have one.")
+        if not replace(implant, density_fraction=None, coils=(), seed=0).is_proposed:
+            raise LandingError(
+                f"{design.name} have no place of their own: give a packing density, or loops x length of every coil in "
+                "parentheses."
+            )
+        filling = given_coils(design, implant.coils) if implant.coils else implant.density_fraction
+        return deploy_coils(design, anatomy, filling, inside=inside, seed=implant.seed)
+    if implant.density_fraction is not None or implant.coils:
+        raise LandingError(f"{design.name} has neither a packing density nor a list of coils: only coils have them.")
     anatomy = on_path(anatomy, implant.placing.path)
     size = size_of(implant, anatomy)
     landing, beside = landing_of(implant, anatomy, size, inside), implant.placing.beside
@@ -435,7 +438,8 @@ def measure_treatment(anatomy: Anatomy, deployed: Mapping[str, Deployment]) -> d
         "implants": {id_: measure(anatomy, one) for id_, one in deployed.items()},
         "jailed_branches": list(jailed_branches(anatomy, stents)),
     }
-    return found | ({"together": together(anatomy, stents)} if len(stents) > 1 else {})
+    measured = list(found["implants"].values())
+    return found | {"together": measure_together(anatomy, [one.stent for one in deployed.values()], measured)}
 
 
 def _porosity(deployed: Mapping[str, Deployment], flow: FlowSettings | None) -> float:
