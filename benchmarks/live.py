@@ -1,6 +1,7 @@
 """Measure the live flow: start, answer to a move, and its difference from the default grid, by vessel and device.
 
-Usage: python benchmarks/live.py [--vessel NAME ...] [--device NAME ...] [--reference] [--longest SECONDS]
+Usage: python benchmarks/live.py [--vessel NAME ...] [--device NAME ...] [--outlets WORD] [--longest SECONDS]
+                                 [--reference [--grid MM]]
 
 Every device begins with a new live flow; its first number is the first whose band the page shows. Without
 `--reference` only the preview is run. With it every flow is also computed on the default grid (minutes each). The last
@@ -13,6 +14,7 @@ flow stored in the case folder; and how long the preparation takes and how large
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter, sleep
@@ -26,7 +28,7 @@ from vstent.flow.indices import indices
 from vstent.flow.lattice.live import LiveFlow
 from vstent.flow.media import media
 from vstent.flow.problem import flow_case
-from vstent.flow.settings import FlowSettings
+from vstent.flow.settings import FlowSettings, Numerics
 from vstent.flow.simulation import simulate_case
 from vstent.geometry.vessel import Anatomy
 
@@ -76,14 +78,14 @@ def moved(anatomy: Anatomy, stent: Stent) -> Stent:
     return vstent.deploy(stent.design, anatomy, size=stent.size, landing=Landing(middle_mm)).stent
 
 
-def full(anatomy: Anatomy, stents: dict[str, Stent]) -> dict[str, float]:
-    """Return the change of the neck inflow on the default grid in percent, by device."""
-    case = flow_case(anatomy, (), FlowSettings())
+def full(anatomy: Anatomy, stents: dict[str, Stent], settings: FlowSettings) -> dict[str, float]:
+    """Return the change of the neck inflow in a full computation in percent, by device."""
+    case = flow_case(anatomy, (), settings)
     bare = simulate_case(case)
     before = indices(bare, case.sac, case.ostium)["neck_inflow_mL_s"]
     found = {}
     for name, stent in stents.items():
-        one = flow_case(anatomy, (stent,), FlowSettings())
+        one = flow_case(anatomy, (stent,), settings)
         now = indices(simulate_case(one, start=bare), one.sac, one.ostium)["neck_inflow_mL_s"]
         found[name] = 100 * (now / before - 1)
     return found
@@ -143,6 +145,8 @@ def main() -> None:
     parser.add_argument("--vessel", nargs="*", default=["demo", "aneurisk_C0038.vtp"], choices=list(SPACINGS_MM))
     parser.add_argument("--device", nargs="*", default=list(DEVICES))
     parser.add_argument("--reference", action="store_true")
+    parser.add_argument("--outlets", default="zero_pressure", help="boundary condition at the outlets")
+    parser.add_argument("--grid", type=float, help="grid spacing of the full computation, mm")
     parser.add_argument("--longest", type=float, default=LONGEST_S, help="seconds that a flow is followed at most")
     parser.add_argument("--switch", action="store_true", help="measure the time from the switch of the page")
     given = parser.parse_args()
@@ -160,13 +164,15 @@ def main() -> None:
         "| after a move: within 3 points, s | within 1 point, s |\n" + 16 * "|---" + "|"
     )
     apart = []
+    settings = FlowSettings(outlets=given.outlets)
+    finer = replace(settings, numerics=Numerics(cell_size_mm=given.grid))
     for name in given.vessel:
         anatomy = anatomy_of(name)
         stents = {one: vstent.deploy(vstent.find_design(one), anatomy).stent for one in given.device}
-        reference = full(anatomy, stents) if given.reference else {}
+        reference = full(anatomy, stents, finer) if given.reference else {}
         for device, stent in stents.items():
             began = perf_counter()
-            live = LiveFlow(flow_case(anatomy, (), FlowSettings()))
+            live = LiveFlow(flow_case(anatomy, (), settings))
             times = [perf_counter()]
             made = media(stent, live.case.blood)
             times.append(perf_counter())

@@ -144,13 +144,14 @@ def test_pictures_of_a_case_are_pngs_with_colour():
 
     found = [plate.drawn() for plate in figures.plates(report_case.scene())]
     assert [picture.id for picture in found] == [
+        "treatment",
+        "streamlines",
+        "shear",
+        "sac_shear",
         "anatomy",
         "contour",
         "coverage",
         "wires",
-        "streamlines",
-        "shear",
-        "sac_shear",
     ]
     for picture in found:
         image = imread(io.BytesIO(picture.png))

@@ -44,10 +44,10 @@ def test_pages_are_a4_and_the_same_report_is_the_same_file(told, printed):
     for width, height in boxes:
         assert float(width) / 72 * 25.4 == pytest.approx(210, abs=0.2)
         assert float(height) / 72 * 25.4 == pytest.approx(297, abs=0.2)
-    without = replace(told, pictures=())
+    without = replace(told, pictures=(), of_method=())
     assert as_pdf(without) == as_pdf(without)
     assert b"CreationDate" not in pdf
-    assert len(re.findall(rb"/Subtype /Image", pdf)) >= len(told.pictures)
+    assert len(re.findall(rb"/Subtype /Image", pdf)) >= len(told.pictures) + len(told.of_method)
     assert len(pdf) < 10_000_000
 
 
@@ -57,7 +57,7 @@ def test_every_number_and_its_definition_stand_in_the_pdf(told, printed):
     assert "outlet 1 4.00 mm 12.6 mm² 8.9, 0.0, 1.3 mm" in text.replace("\u202f", " ")
     assert "Braid angle " in text
     assert "braid angle rad" not in text
-    assert OF_PULSE in text.partition("Definitions")[2]
+    assert OF_PULSE in text.partition("Appendix: definitions")[2]
     for quantity in (*told.vessel, *(q for implant in told.implants for q in implant["quantities"])):
         assert quantity.name in text, quantity
         assert " ".join(quantity.text.split()) in text, quantity
@@ -66,11 +66,40 @@ def test_every_number_and_its_definition_stand_in_the_pdf(told, printed):
             assert " ".join(value.text.split()) in text, value
     for definition, _ in told.definitions:
         assert definition.name in text
-    assert all(picture.title in text for picture in told.pictures)
+    assert all(picture.title in text for picture in (*told.pictures, *told.of_method))
+
+
+def test_the_first_page_is_the_answer_and_the_appendix_begins_within_ten_pages(told):
+    put, pages = Paper._put, []
+
+    def noted(paper, x, y, text, size, **more):
+        pages.extend([] for _ in range(paper._number - len(pages)))
+        pages[-1].append((y, text))
+        put(paper, x, y, text, size, **more)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Paper, "_put", noted)
+        as_pdf(told)
+    first = " ".join(text for _, text in pages[0])
+    for words in (told.name, told.origin, "Neck inflow", "Mean sac velocity", "Warnings"):
+        assert words in first
+    (appendix,) = (k for k, page in enumerate(pages) if any(text == "Appendix: method" for _, text in page))
+    assert appendix < 10
+    lowest_in = [min(y for y, _ in page if y > 0.5) for page in pages[:appendix]]
+    assert max(lowest_in) < 0.5 * PAGE_IN[1]
+
+
+def test_no_word_of_the_code_and_no_hyphen_for_minus_is_in_the_pdf(printed):
+    text = printed[1]
+    for word in ("outlet_1", "zero_pressure", "(--", " True", " False", "None"):
+        assert word not in text
+    assert not re.search(r"(?<![\w.–-])-\d", text)
 
 
 def test_the_pdf_is_written_where_it_is_asked_for(told, tmp_path, monkeypatch):
-    monkeypatch.setattr(import_module("vstent.reporting.write"), "contents_of", lambda *_: replace(told, pictures=()))
+    monkeypatch.setattr(
+        import_module("vstent.reporting.write"), "contents_of", lambda *_: replace(told, pictures=(), of_method=())
+    )
     write_report(report_case.case(), tmp_path)
     assert not (tmp_path / "report.pdf").exists()
     write_report(report_case.case(), tmp_path, is_printed=True)
@@ -92,10 +121,10 @@ def test_lines_keep_inside_the_page():
 
 def test_pictures_tell_the_way_from_the_artery_to_the_flow(told):
     names = [picture.id for picture in told.pictures]
-    assert names == [
-        *("anatomy", "free", "restoration", "spheres", "first", "mesh", "rule"),
+    assert names == ["treatment", "streamlines", "shear", "sac_shear", "anatomy", "contour", "coverage", "wires"]
+    assert [picture.id for picture in told.of_method] == [
+        *("free", "restoration", "spheres", "first", "mesh", "rule"),
         *("expansion-silk", "expansion-enterprise", "fitted"),
-        *("contour", "coverage", "wires", "streamlines", "shear", "sac_shear"),
     ]
 
 

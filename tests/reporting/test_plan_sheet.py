@@ -8,6 +8,7 @@ import pytest
 
 import vstent
 from vstent import phantoms
+from vstent.anatomy.morphology import morphology
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.deployment.measure import measure
@@ -17,6 +18,7 @@ from vstent.plan.bands import bands
 from vstent.plan.rank import alternatives, rank
 from vstent.reporting.paper import Paper
 from vstent.reporting.plan_sheet import Planned, plan_pdf
+from vstent.reporting.quantities import format_value
 
 NOTES = tuple(f"A note that fills a good part of a line on paper, number {k}." for k in range(9))
 
@@ -92,6 +94,10 @@ def test_it_states_what_was_measured(planned) -> None:
     for deployment, metrics in all_of(case):
         assert f"{deployment.stent.deployed_length_mm:.1f} mm" in text
         assert f"{100 * metrics['neck_metal_coverage_fraction']:.1f} %" in text
+    sac = morphology(anatomy())
+    for key in ("sac_max_diameter_mm", "neck_min_diameter_mm", "parent_proximal_diameter_mm"):
+        assert format_value(key, sac[key]).replace("\u202f", " ") in text
+    assert re.search(r"C-arm for a view in profile (LAO|RAO) \d+ (CRA|CAU) \d+ ", text)
     assert "2026-11-26" in text
     assert "9f9f9f9f9f9f9f9f…" in text
     assert text.count("8 more notes are in the report.") == 3

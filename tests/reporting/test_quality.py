@@ -85,8 +85,8 @@ def test_a_case_without_grades_has_none() -> None:
 
 def test_percentages_change_in_points() -> None:
     """An area of 0.085 % that becomes 1.31 % has not grown by 1439 %."""
-    assert format_change(0.00085, 0.0131, "low_shear_area_fraction") == "+1.2\u202fpoints"
-    assert format_change(0.0, 0.25, "low_shear_area_fraction") == "+25\u202fpoints"
+    assert format_change(0.00085, 0.0131, "low_shear_area_fraction") == "+1.2 percentage points"
+    assert format_change(0.0, 0.25, "low_shear_area_fraction") == "+25 percentage points"
 
 
 def test_better_and_worse_only_where_a_direction_is_wanted() -> None:

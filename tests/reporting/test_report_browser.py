@@ -60,4 +60,4 @@ def test_without_webgl_the_page_says_so_and_keeps_its_pictures(tmp_path):
     dom, _ = browse(tmp_path, "--disable-3d-apis", "--disable-gpu", "--window-size=1280,720", "--dump-dom")
     assert "needs WebGL" in dom
     assert "<canvas" not in dom
-    assert dom.count("<img ") == len(report_case.contents().pictures)
+    assert dom.count("<img ") == sum(map(len, (report_case.contents().pictures, report_case.contents().of_method)))

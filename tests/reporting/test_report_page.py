@@ -18,7 +18,7 @@ from vstent.flow.case import Phase
 from vstent.flow.settings import Blood, CarreauYasuda, FlowSettings, Numerics
 from vstent.reporting.definitions import DEFINITIONS, HEADLINES, OF_PULSE
 from vstent.reporting.page import as_html, contents_of, limits_of, report
-from vstent.reporting.quantities import compare, flatten, format_change, format_number, format_value, split_unit
+from vstent.reporting.quantities import compare, flatten, format_change, format_number, format_value, split_unit, spoken
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_ids_are_unique_and_every_anchor_leads_somewhere(page):
 
 def test_every_picture_has_words_for_those_who_cannot_see_it(page):
     pictures = [attributes for tag, attributes in page.tags if tag == "img"]
-    assert len(pictures) == 16
+    assert len(pictures) == 17
     assert all(len(attributes["alt"]) > 40 for attributes in pictures)
 
 
@@ -204,7 +204,9 @@ def test_provenance_is_whole(page):
         ("screen_resistance_Pa_per_m_s", 480.2, "480 Pa/(m/s)"),
         ("sac_volume_mm3", 1520.4, "1520 mm³"),
         ("max_outside_mm", 0.0, "0 mm"),
-        ("max_outside_mm", 1.2e-6, "1.20e-06 mm"),
+        ("max_outside_mm", 1.2e-6, "0 mm"),
+        ("max_wall_gap_mm", 0.00675, "0.007 mm"),
+        ("max_outside_mm", -0.0512, "−0.051 mm"),
         ("malapposition_volume_mm3", 1.08e-13, "0 mm³"),
         ("sac_kinetic_energy_J", 4.16e-5, "41.6 µJ"),
         ("outlets_mL_s", [1.5, 2.25], "1.50 mL/s, 2.25 mL/s"),
@@ -237,9 +239,19 @@ def test_units_are_the_longest_ending(key, expected):
     assert split_unit(key) == expected
 
 
+def test_sentences_of_the_program_are_said_as_on_a_page():
+    note = "The inlet, 4.2 mm wide at (-0.2, 1.8) mm; +-0.067 mm, 5% of outlet_2. Choose the inlet (--inlet), or none."
+    assert spoken(note) == (
+        "The inlet, 4.2 mm wide at (−0.2, 1.8) mm; ±0.067 mm, 5\u202f% of outlet 2. Choose the inlet, or none."
+    )
+    assert spoken("2026-11-28, 3-D, 1e-5, 18.8-35.1 mm") == "2026-11-28, 3-D, 1e-5, 18.8-35.1 mm"
+
+
 def test_changes():
     assert format_change(0.4, 0.26).replace("\u202f", " ") == "−35 %"
     assert format_change(2.0, 2.1).replace("\u202f", " ") == "+5.0 %"
+    assert format_change(2.0, 1.9999) == format_change(2.0, 2.0001) == "0.0\u202f%"
+    assert format_change(0.93, 0.93096, "outlet_1_share_fraction") == "+0.1 percentage points"
     assert format_change(0.056, 39.92, "unexchanged_after_2s_volume_mm3") == "+39.9\u202fmm³"
     assert format_change(0.0, -39.92, "unexchanged_after_2s_volume_mm3") == "−39.9\u202fmm³"
     assert format_change(4.0, 39.92, "unexchanged_after_2s_volume_mm3") == "+898\u202f%"
@@ -291,7 +303,7 @@ def test_ratios_and_openings_go_by_the_words_of_what_they_are_of():
 
 def test_every_opening_is_told_with_its_width_and_place(page):
     row = page.text.partition("Center (LPS)")[2].replace("\u202f", " ")
-    assert row.startswith(" inlet 4.00 mm 12.6 mm² -8.9, 0.0, 1.3 mm outlet 1 4.00 mm 12.6 mm² 8.9, 0.0, 1.3 mm")
+    assert row.startswith(" inlet 4.00 mm 12.6 mm² −8.9, 0.0, 1.3 mm outlet 1 4.00 mm 12.6 mm² 8.9, 0.0, 1.3 mm")
 
 
 def test_facts_on_a_device_are_named_without_the_unit_of_their_key(page):
@@ -308,7 +320,13 @@ def test_ranked_treatments_have_a_table_and_their_reasons_and_are_no_other_numbe
     row |= {"neck_inflow_change_fraction": -0.31, "jailed_branches": {"outlet_2": -0.123}}
     ranked = bare_case()
     text = report(SimpleNamespace(**{**vars(ranked), "metrics": ranked.metrics | {"ranking": [row]}}))
-    for cell in ("silk &lt;1&gt;", "<td>50</td>", "<td>-31%</td>", "outlet_2 -12%", "Neck inflow &amp; more."):
+    for cell in (
+        "silk &lt;1&gt;",
+        "<td>50</td>",
+        "<td>−31\u202f%</td>",
+        "outlet 2 −12\u202f%",
+        "Neck inflow &amp; more.",
+    ):
         assert cell in text
     assert '<a href="#ranking">Treatments</a>' in text
     assert "Other numbers" not in text

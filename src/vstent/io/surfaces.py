@@ -146,7 +146,7 @@ def _read(path: Path) -> tuple[Surface, str]:
                 f"room for {(n_bytes - 84) // 50}. Copy or export it again."
             )
     if is_wrong:
-        raise ReadError(f"{path.name} is not a {kind} file: it begins with {head[:16]!r}. Export it again.")
+        raise ReadError(f"{path.name} is not a {kind} file: its first bytes are not of that type. Export it again.")
     if kind == ".stl" and is_text and not is_whole and b"endsolid" not in tail:  # VTK reads some of these as binary
         raise ReadError(f"{path.name} holds fewer triangles than it states: it breaks off. Copy or export it again.")
     with read_apart("mesh", path, {}, [path]) as (arrays, words):

@@ -25,6 +25,7 @@ class Drawing:
         self._pool = ThreadPoolExecutor(config.NUMBA_NUM_THREADS)
         self._scene: Scene | None = None
         self._begun: list[Future[Picture]] = []
+        self._of_method: list[Future[Picture]] = []
 
     def __enter__(self) -> Self:
         """Return the drawing."""
@@ -38,11 +39,11 @@ class Drawing:
         """Begin to draw all pictures of what a study has computed, unless this has been done; return its scene."""
         if self._scene is None:
             self._scene = scene_of(case.anatomy, case.implants, case.fields)
-            before, *after = plates(self._scene)
-            wanted = [before, *method_plates(case.anatomy, case.implants, self._scene, case.whole), *after]
-            self._begun = [self._pool.submit(plate.drawn) for plate in wanted]
+            self._begun = [self._pool.submit(plate.drawn) for plate in plates(self._scene)]
+            of_method = method_plates(case.anatomy, case.implants, self._scene, case.whole)
+            self._of_method = [self._pool.submit(plate.drawn) for plate in of_method]
         return self._scene
 
-    def pictures(self) -> tuple[Picture, ...]:
-        """Return the pictures in the order of the report, as soon as all of them are drawn."""
-        return tuple(one.result() for one in self._begun)
+    def pictures(self) -> tuple[tuple[Picture, ...], tuple[Picture, ...]]:
+        """Return the pictures of the results and those of the method, as soon as all of them are drawn."""
+        return tuple(one.result() for one in self._begun), tuple(one.result() for one in self._of_method)

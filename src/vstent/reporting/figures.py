@@ -107,8 +107,8 @@ class Shot:
 def plates(scene: Scene) -> list[Plate]:
     """Return the pictures of a scene, to be drawn.
 
-    The anatomy is always shown; contour, coverage and wires where there is a device; streamlines and wall shear stress
-    where a flow was computed.
+    Treatments come first, if there are any; then streamlines and wall shear stress where a flow was computed; then the
+    anatomy; then contour, coverage and wires where there is a device.
     """
     bare, *devices = scene.panes
 
@@ -123,8 +123,15 @@ def plates(scene: Scene) -> list[Plate]:
     layers = ("lumen", "continued", "landing", "sac", "neck")
     shots = [Shot(title, scene.pick(layers, bare[0]), scene.view(view)) for view, title in sides.items()]
     caption = "The patient's lumen (glass), the restored parent artery (sand), the sac (red) and the neck (red line)."
-    drawn = [Plate("anatomy", "The artery and its sac", caption, scene, shots)]
+    anatomy = Plate("anatomy", "The artery and its sac", caption, scene, shots)
+    present = {layer.id for layer in scene.layers}
+    drawn = [*(by_value(*row) for row in _OF_FLOW if row[0] in present), anatomy]
     if devices:
+        treated = ("lumen", "continued", "sac", "wires", "neck")
+        caption = "The devices in the patient's artery with its sac; the red line is the neck."
+        title = "The treatment in the artery" if len(devices) == 1 else "The treatments in the artery"
+        shots = [Shot(words, scene.pick(treated, pane), scene.view("profile")) for pane, words in devices]
+        drawn.insert(0, Plate("treatment", title, caption, scene, shots))
         coverage = (
             "Metal coverage: fraction of the contour covered by metal, measured on the wires and averaged over a "
             "few pores. In a bend, wires at more than 45° to the axis (flow diverters) are denser on the inner side, "
@@ -137,7 +144,7 @@ def plates(scene: Scene) -> list[Plate]:
         shots = [
             Shot(f"{title}: {shot.title.lower()}", shot.layers, shot.view)
             for pane, title in devices
-            for shot in wire_shots(scene, pane)
+            for shot in wire_shots(scene, pane)[-1:]
         ]
         ids = ("lumen", "continued", "coverage", "neck")
         meshes = [(pane, title) for pane, title in devices if scene.pick(("contour",), pane)]  # coils have none
@@ -145,8 +152,7 @@ def plates(scene: Scene) -> list[Plate]:
             drawn.append(_contours(scene, meshes))
             drawn.append(by_value("coverage", ids, "Metal coverage of the wall", coverage, meshes))
         drawn.append(Plate("wires", "Wires across the neck", wires, scene, shots))
-    present = {layer.id for layer in scene.layers}
-    return drawn + [by_value(*row) for row in _OF_FLOW if row[0] in present]
+    return drawn
 
 
 _OF_FLOW = (

@@ -43,7 +43,7 @@ def font(points: float) -> "FreeTypeFont":
 
 def put_title(picture: "Picture", words: str, left: float, base: float) -> None:
     """Write the title of a panel, its base line at a height."""
-    _write(picture, words, (left, base), 8.5, INK, "ls")
+    _write(picture, words, (left + points_px(2), base), 8.5, INK, "ls")
 
 
 def length_bar(picture: "Picture", width_mm: float, corner: tuple[int, int], size: tuple[int, int]) -> None:

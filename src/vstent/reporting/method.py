@@ -255,17 +255,14 @@ def _expansion(name: str, number: int, deployed: Mapping[str, Deployment], anato
         layer = replace(contour, surface=surface, values=gap_mm, frames_mm=None, frame_values=None)
         words = "Initial contour"
         if count:
-            words = f"After {counted(count, 'iteration')}, {100 * reached[count]:.0f} % of the nodes terminated"
+            words = f"After {counted(count, 'iteration')}: {100 * reached[count]:.0f} % of the nodes on the wall"
         shots.append(Shot(words, (*_glass(scene), layer), scene.view("profile")))
     # Earlier contours have larger gaps than the deployed device, so its scale would be too narrow.
     gap = scene.scale("wall_gap")
     wide = replace(gap, high=round_up(max(gap.high, float(np.percentile(gaps_mm[0], 98)))))
     shown = replace(scene, scales=tuple(wide if scale is gap else scale for scale in scene.scales))
     title = f"Expansion of {implant_titles(deployed, f'{name}: ')[key]}"
-    caption = (
-        "Expansion of the active contour to the wall of the parent artery (glass) in "
-        f"{counted(len(deployment.history_mm) - 1, 'iteration')}, colored by the remaining gap."
-    )
+    caption = "Expansion of the active contour to the wall of the parent artery (glass), colored by the remaining gap."
     plate = f"expansion-{name}" if number == 0 else f"expansion-{name}-{number + 1}"
     return Plate(plate, title, caption, shown, shots, "wall_gap")
 

@@ -2,8 +2,10 @@
 
 import base64
 import hashlib
+import re
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from datetime import date
 from importlib.resources import files
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any, Final
@@ -23,7 +25,7 @@ from vstent.reporting.drawing import Drawing
 from vstent.reporting.figures import Picture
 from vstent.reporting.packing import pack
 from vstent.reporting.quality import OF_GRADES, Quality, qualities
-from vstent.reporting.quantities import Change, Quantity, base_of, compare, flatten, opening_rows, unit_of
+from vstent.reporting.quantities import Change, Quantity, base_of, compare, flatten, opening_rows, spoken, unit_of
 from vstent.reporting.ranked import HEAD, treatment_rows
 from vstent.reporting.scene import Scene, titled, treatment_title
 from vstent.reporting.uncertainty import Varied, band_rows, how_sure, uncertainty_of
@@ -47,6 +49,8 @@ AT_OUTLETS: Final = {
     "windkessel": "the Windkessel downstream of every outlet is assumed, unless a table states it",
 }
 """Limit that a report states, by the outlet setting of the flow."""
+HASH_DIGITS: Final = 16
+"""Number of digits of the input's SHA-256 that are printed."""
 SHOWN: Final = ("implants", "together", "flow", "change", "quality", "uncertainty", "jailed_branches")
 """Metrics of a treatment that have a section of their own."""
 AT_INLETS: Final = "The flow through each inlet is assumed, not measured in the patient."
@@ -78,7 +82,9 @@ class Contents:
     scene: Scene
     """Layers, color scales and views."""
     pictures: tuple[Picture, ...]
-    """Pictures in the order of the report."""
+    """Pictures of the results, in the order of the report."""
+    of_method: tuple[Picture, ...]
+    """Pictures of the way to them."""
     changes: list[Change]
     """Flow metrics of the bare artery and with each treatment."""
     implants: list[dict[str, Any]]
@@ -93,6 +99,8 @@ class Contents:
     """Limits of the results, one sentence each."""
     provenance: list[tuple[str, list[tuple[str, str]]]]
     """Versions, input and settings: groups of (name, value) lines by title."""
+    origin: str
+    """Date of the report and input, in one clause."""
     film: bytes = b""
     """Films of the contrast agent before and after, as an animated WebP; empty: none."""
 
@@ -158,7 +166,7 @@ def contents_of(case: "CaseResult", drawing: Drawing | None = None) -> Contents:
     """Return the contents of the report of a case, with all pictures rendered."""
     with drawing or Drawing() as drawn:
         scene, metrics = drawn.begin(case), case.metrics
-        pictures = drawn.pictures()
+        pictures, of_method = drawn.pictures()
     implants: list[dict[str, Any]] = []
     told: set[str] = set()
     for name, key, title, deployment in titled(case.implants):
@@ -174,6 +182,7 @@ def contents_of(case: "CaseResult", drawing: Drawing | None = None) -> Contents:
         metrics=metrics,
         scene=scene,
         pictures=pictures,
+        of_method=of_method,
         changes=compare(metrics, unusable(metrics)),
         implants=implants,
         openings=opening_rows(case.anatomy.vessel.openings),
@@ -181,7 +190,14 @@ def contents_of(case: "CaseResult", drawing: Drawing | None = None) -> Contents:
         notes=tuple(case.notes),
         limits=limits_of(case),
         provenance=_provenance(case.provenance),
+        origin=_origin(case.provenance.get("input", {})),
     )
+
+
+def _origin(source: dict[str, Any]) -> str:
+    """Return the date of a report and its input in one clause."""
+    name, digits = source.get("name", ""), source.get("sha256", "")[:HASH_DIGITS]
+    return f"{date.today().isoformat()}{f' · {name}' if name else ''}{f' · SHA-256 {digits}…' if digits else ''}"
 
 
 def limits_of(case: "CaseResult") -> tuple[str, ...]:
@@ -213,8 +229,10 @@ def as_html(told: Contents) -> str:
     # A closing tag in a script would end it in HTML; the policy lets only these exact texts run.
     scripts = [asset(name).replace("</script", "<\\/script") for name in ("viewer.js", "start.js")]
     hashes = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
+    shown = [*told.pictures, *told.of_method]
     with ThreadPoolExecutor(config.NUMBA_NUM_THREADS) as pool:
-        images = list(pool.map(lambda picture: base64.b64encode(picture.webp).decode("ascii"), told.pictures))
+        images = list(pool.map(lambda one: Markup(base64.b64encode(one.webp).decode("ascii")), shown))
+    pictures = list(zip(shown, images, strict=True))
     sections = {
         "summary": "Summary",
         "scene": "3-D view",
@@ -228,7 +246,7 @@ def as_html(told: Contents) -> str:
         "definitions": "Definitions",
         "provenance": "Method",
     }
-    environment = Environment(loader=PackageLoader("vstent.reporting", "assets"), autoescape=True)
+    environment = Environment(loader=PackageLoader("vstent.reporting", "assets"), autoescape=True, finalize=_said)
     return environment.get_template("report.html.j2").render(
         told=told,
         sections=[(name, title) for name, title in sections.items() if title],
@@ -238,11 +256,17 @@ def as_html(told: Contents) -> str:
         ranked=(HEAD, treatment_rows(told.metrics.get("ranking", ()))),
         of_grades=OF_GRADES,
         of_pulse=OF_PULSE,
-        pictures=list(zip(told.pictures, images, strict=True)),
-        film=base64.b64encode(told.film).decode("ascii"),
+        pictures=pictures[: len(told.pictures)],
+        of_method=pictures[len(told.pictures) :],
+        film=Markup(base64.b64encode(told.film).decode("ascii")),
         manifest=manifest,
-        scene_bytes=scene_bytes,
+        scene_bytes=Markup(scene_bytes),
     )
+
+
+def _said(value: Any) -> Any:
+    """Return what a template shows: sentences as a page says them."""
+    return spoken(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
 
 def asset(name: str) -> str:
@@ -257,9 +281,11 @@ def _implant(
     stent = deployment.stent
     diameters = ", ".join(f"{d:g}" for d in np.unique(stent.wire_diameter_um))
     wires = f"{len(stent.wire_diameter_um)} wires or struts of {diameters} µm"
-    how = "terminated" if deployment.outcome == "terminated" else "stopped at its iteration limit"
     steps = counted(len(deployment.terminated_fraction), "iteration")
-    words = f"The contour {how} after {steps}, in {deployment.seconds:.2f} s."
+    how = f"The active contour reached the wall in {steps}"
+    if deployment.outcome != "terminated":
+        how = f"The active contour stopped at its limit of {steps}"
+    words = f"{how} ({deployment.seconds:.2f} s)."
     if isinstance(stent, Coils):
         wires = f"{counted(len(stent.coils), 'coil')} of {diameters} µm"
         words = f"Pushed in one after the other, in {deployment.seconds:.0f} s; seed {stent.seed}."
@@ -306,8 +332,12 @@ def _plain(value: Any) -> str:
     """Return a setting as text; of a path only its last part, because folders may be named after a patient."""
     if isinstance(value, PurePath) or (isinstance(value, str) and value.startswith("/")):
         return PurePath(value).name
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:.4g}"
+    if isinstance(value, str) and re.fullmatch(r"[a-z]+(_[a-z]+)+", value):
+        return value.replace("_", " ")
     if isinstance(value, (list, tuple)):
         return ", ".join(_plain(one) for one in value)
     return "–" if value is None else str(value)

@@ -2,10 +2,12 @@
 
 import io
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+
+from vstent.reporting.quantities import spoken
 
 if TYPE_CHECKING:
     from vstent.reporting.figures import Picture
@@ -18,6 +20,12 @@ INK, QUIET, ACCENT, LINE, WARN = "#16262e", "#54666f", "#0b6473", "#d7dfe3", "#8
 """Colors of text, secondary text, headings, rules and the statement at the foot."""
 _CHARACTER: Final = 0.53
 """Mean width of a character as a fraction of the font size, for line breaks."""
+BESIDE_IN: Final = 0.25
+"""Distance in inches between two columns of names and values."""
+AROUND: Final = 1.15
+"""Height of the title and caption of a picture in inches."""
+SMALLEST: Final = 0.45
+"""Smallest size of a picture that then fits on the current page, as a fraction of its usual one."""
 BADGE: Final = "Research use only. Not a medical device."
 """Statement at the foot of every page."""
 
@@ -103,31 +111,45 @@ class Paper:
     def text(self, words: str, size: float = 8.5, *, color: str = INK, indent: float = 0.0) -> None:
         """Write a paragraph; `size` is in points, `indent` in inches."""
         step = 1.45 * size / 72
-        for line in wrapped(words, self._width - indent, size):
+        for line in wrapped(spoken(words), self._width - indent, size):
             self.room(step)
             self._y -= step
             self._put(LEFT + indent, self._y, line, size, color=color)
         self._y -= 0.05
 
-    def table(self, rows: Iterable[Sequence[str]], widths: Sequence[float], *, head: Sequence[str] = ()) -> None:
-        """Write a table with columns of a fraction of the text width, the first aligned left, the others right."""
+    def table(
+        self,
+        rows: Iterable[Sequence[str]],
+        widths: Sequence[float],
+        *,
+        head: Sequence[str] = (),
+        names: Collection[int] = (0,),
+    ) -> None:
+        """Write a table with columns of a fraction of the text width, those of `names` aligned left, others right."""
         if head:
-            self._row(head, widths, QUIET, "bold")
+            self._row(head, widths, QUIET, "bold", names)
         for row in rows:
-            self._row(row, widths, INK, "normal")
+            self._row(row, widths, INK, "normal", names)
 
-    def _row(self, cells: Sequence[str], widths: Sequence[float], color: str, weight: str) -> None:
+    def _row(
+        self, cells: Sequence[str], widths: Sequence[float], color: str, weight: str, names: Collection[int]
+    ) -> None:
         """Write one row of a table, with a line above it."""
         size, step = 8.0, 0.155
         bold = 1.1 if weight == "bold" else 1.0
-        lines = [wrapped(cell, self._width * w - 0.12, size * bold) for cell, w in zip(cells, widths, strict=True)]
+        columns = zip(map(spoken, cells), widths, strict=True)
+        lines = [wrapped(cell, self._width * w - 0.12, size * bold) for cell, w in columns]
         self.room(step * max(map(len, lines)) + 0.05)
         self._rule()
         for i, found in enumerate(lines):
-            x = LEFT + self._width * (sum(widths[: i + 1]) if i else 0.0)
+            x = (
+                LEFT
+                + self._width * sum(widths[:i] if i in names else widths[: i + 1])
+                + BESIDE_IN * (i in names and i > 0)
+            )
             for k, line in enumerate(found):
                 y = self._y - step * (k + 1)
-                self._put(x, y, line, size, color=color, weight=weight, ha="right" if i else "left")
+                self._put(x, y, line, size, color=color, weight=weight, ha="left" if i in names else "right")
         self._y -= step * max(map(len, lines)) + 0.05
 
     def _rule(self) -> None:
@@ -139,13 +161,18 @@ class Paper:
         level = [(self._y - 0.01) / height] * 2
         self._figure.add_artist(Line2D(ends, level, color=LINE, linewidth=0.5))
 
-    def picture(self, picture: "Picture", most: float = 0.5) -> None:
-        """Write a picture with title and caption, at most a fraction `most` of the page high."""
+    def picture(self, picture: "Picture", most: float = 0.36) -> None:
+        """Write a picture with title and caption, at most a fraction `most` of the page high.
+
+        It is smaller where it then fits on the current page.
+        """
         image = picture.image
         height = self._width * image.shape[0] / image.shape[1]
         fit = min(1.0, most * self._page[1] / height)
+        left = (self._y - FOOT - AROUND - 0.01) / height
+        fit = left if SMALLEST * fit < left < fit else fit
         width, height = fit * self._width, fit * height
-        self.room(height + 1.15)
+        self.room(height + AROUND)
         self.heading(picture.title)
         left = LEFT + (self._width - width) / 2
         self._y -= height

@@ -1,11 +1,30 @@
-"""Report as PDF: A4 pages with searchable text, the pictures, and every metric with its definition."""
+"""Report as PDF on A4 pages: the answer, then flow, anatomy and devices, then an appendix on how they were found."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import Any, Final
 
+from vstent.flow.grade import GOOD
 from vstent.reporting.definitions import OF_PULSE
 from vstent.reporting.page import Contents
-from vstent.reporting.paper import ACCENT, QUIET, Paper
-from vstent.reporting.quantities import Change, Quantity
+from vstent.reporting.paper import ACCENT, PAGE_IN, QUIET, Paper
+from vstent.reporting.quantities import Change, Quantity, format_change
+from vstent.reporting.ranked import HEAD, treatment_rows
+from vstent.reporting.uncertainty import between, ends
+
+ANSWERS: Final = ("neck_inflow_mL_s", "mean_sac_velocity_m_s", "mean_sac_wss_Pa")
+"""Metrics of the flow on the first page."""
+OF_DEVICE: Final = ("neck_metal_coverage_fraction", "deployed_length_mm")
+"""Metrics of every implant on the first page."""
+OF_RESULTS: Final = {
+    "treatment": "",
+    "anatomy": "Anatomy",
+    "contour": "Devices",
+    "coverage": "Devices",
+    "wires": "Devices",
+}
+"""Section of a picture by its name; those of the flow are the others."""
+BESIDE: Final = 3
+"""Largest number of implants in one table."""
 
 
 def as_pdf(told: Contents) -> bytes:
@@ -14,47 +33,124 @@ def as_pdf(told: Contents) -> bytes:
 
     with rc_context({"pdf.fonttype": 42, "font.family": "DejaVu Sans"}):
         paper = Paper(told.name)
-        paper.title(told.name)
-        paper.text(
-            "Virtual stenting report. Blood flow without and with each device; change is with / without − 1, or the "
-            "difference in percentage points."
-        )
-        if told.headlines:
-            paper.heading("Before and after")
-            _changes(paper, told, told.headlines)
-            for one in told.qualities:
-                paper.text(f"{one.sentence} {one.computation.capitalize()}.")
-            if told.is_pulse:
-                paper.text(OF_PULSE)
-        else:
-            paper.text("No blood flow was computed for this case.")
-        for picture in told.pictures:
-            paper.picture(picture)
+        _answer(paper, told)
+        _flow(paper, told)
         paper.heading("Anatomy")
-        paper.table(_rows(told.vessel, 1), (0.66, 0.34))
+        _pictures(paper, told, "Anatomy")
+        _pairs(paper, _rows(told.vessel, 1))
         paper.heading("Openings")
         paper.table(told.openings, (0.25, 0.2, 0.2, 0.35), head=("Opening", "Diameter", "Area", "Center (LPS)"))
         _devices(paper, told)
-        if told.changes:
-            paper.heading("Blood flow")
-            _changes(paper, told, told.changes)
         for varied in told.uncertainty:
             paper.heading(f"Uncertainty: {varied.title}")
             paper.text(varied.words)
-            rows = [
-                (
-                    row.name,
-                    row.mean,
-                    f"{row.low} to {row.high}",
-                    ", ".join(f"{c} {100 * s:.0f} %" for c, s in row.shares),
-                )
-                for row in varied.rows
-            ]
-            paper.table(
-                rows, (0.27, 0.13, 0.24, 0.36), head=("Result", "Mean", "95 % lie between", "Share of each cause")
-            )
-        _words(paper, told)
+            head = ("Result", "Mean", "95 % lie between", "Share of each cause")
+            rows = [(row.name, row.mean, row.band, _shares(row.shares)) for row in varied.rows]
+            paper.table(rows, (0.27, 0.13, 0.24, 0.36), head=head)
+        paper.heading("Notes and limits")
+        for note in (*told.notes, *told.limits):
+            paper.text(f"• {note}")
+        _appendix(paper, told)
         return paper.done()
+
+
+def _answer(paper: Paper, told: Contents) -> None:
+    """Write the first page: picture, five numbers with bands and grades, warnings, date, case and input."""
+    paper.title(told.name)
+    paper.text(f"Virtual stenting report, {told.origin}")
+    _pictures(paper, told, "")
+    if told.changes:
+        paper.heading("Before and after")
+    _table(paper, told, [row for key in ANSWERS for row in told.changes if row.before.key == key], answers=True)
+    if not told.changes:
+        paper.text("No blood flow was computed for this case.")
+    paper.heading("Warnings")
+    poor = [one.sentence for one in told.qualities if one.grade != GOOD]
+    for sentence in (*poor, *(one["advice"] for one in told.implants)):
+        paper.text(f"• {sentence}")
+    paper.text(f"{len(told.notes) + len(told.limits)} notes and limits follow after the devices.", 8, color=QUIET)
+
+
+def _flow(paper: Paper, told: Contents) -> None:
+    """Write pictures and numbers of the flow, and the ranking of the treatments."""
+    if not told.changes:
+        return
+    paper.heading("Blood flow")
+    for one in told.qualities:
+        paper.text(f"{one.sentence} {one.computation[0].upper()}{one.computation[1:]}.")
+    if told.is_pulse:
+        paper.text(OF_PULSE)
+    _pictures(paper, told, "Blood flow")
+    _table(paper, told, told.changes)
+    if rows := told.metrics.get("ranking"):
+        paper.heading("Treatments, the best first")
+        paper.table(treatment_rows(rows), (0.22, *[0.78 / (len(HEAD) - 1)] * (len(HEAD) - 1)), head=HEAD)
+        for row in rows:
+            paper.text(f"• {row['treatment']}: {row['reason']}")
+
+
+def _devices(paper: Paper, told: Contents) -> None:
+    """Write pictures and numbers of all implants side by side, with bands where there are any."""
+    if told.implants:
+        paper.heading("Devices and deployment")
+    _pictures(paper, told, "Devices")
+    for implant in told.implants:
+        paper.text(f"{implant['title']}: {implant['words']} {implant['how_sure']}")
+    for k in range(0, len(told.implants), BESIDE):
+        beside = told.implants[k : k + BESIDE]
+        values = [
+            {_named(one, 2): _banded(one, implant["bands"]) for one in implant["quantities"]} for implant in beside
+        ]
+        names = dict.fromkeys(name for one in values for name in one)
+        rows = [(name, *(one.get(name, "–") for one in values)) for name in names]
+        width = 0.64 / len(beside)
+        paper.table(rows, (0.36, *[width] * len(beside)), head=("", *(one["title"] for one in beside)))
+
+
+def _appendix(paper: Paper, told: Contents) -> None:
+    """Write method, definitions, sources and settings."""
+    paper.room(0.3 * PAGE_IN[1])
+    paper.heading("Appendix: method")
+    for picture in told.of_method:
+        paper.picture(picture, most=0.22)
+    paper.heading("Appendix: definitions")
+    if told.changes:
+        paper.text(OF_PULSE, 8)
+    for definition, unit in told.definitions:
+        source = f" ({definition.source})" if definition.source else ""
+        paper.text(f"{definition.name}{f' [{unit}]' if unit else ''}: {definition.meaning}{source}", 8)
+    for implant in told.implants:
+        if implant["facts"]:
+            paper.heading(f"Appendix: sources of the numbers of {implant['title']}")
+            paper.table(implant["facts"], (0.26, 0.74))
+        if causes := [(row.name, row.cause) for row in implant["bands"] if row.cause]:
+            paper.text("Largest cause of each band (95 %):", 8, color=QUIET)
+            _pairs(paper, causes)
+    paper.heading("Appendix: settings and versions")
+    for title, lines in told.provenance:
+        paper.text(title, color=ACCENT)
+        _pairs(paper, [line for line in lines if line[1] != "–"])
+
+
+def _pictures(paper: Paper, told: Contents, section: str) -> None:
+    """Write the pictures of a section."""
+    for picture in told.pictures:
+        if OF_RESULTS.get(picture.id, "Blood flow") == section:
+            paper.picture(picture)
+
+
+def _pairs(paper: Paper, rows: Sequence[tuple[str, str]]) -> None:
+    """Write names and values in two columns."""
+    half = -(-len(rows) // 2)
+    beside = [*rows[half:], *[("", "")] * (2 * half - len(rows))]
+    paper.table(
+        [(*one, *other) for one, other in zip(rows[:half], beside, strict=True)], (0.3, 0.18, 0.34, 0.18), names=(0, 2)
+    )
+
+
+def _shares(shares: Iterable[tuple[str, float]]) -> str:
+    """Return causes with their shares of the variance."""
+    return ", ".join(f"{cause} {100 * share:.0f} %" for cause, share in shares)
 
 
 def _rows(quantities: Iterable[Quantity], skip: int) -> list[tuple[str, str]]:
@@ -68,8 +164,14 @@ def _named(quantity: Quantity, skip: int) -> str:
     return f"{place}: {quantity.name}" if place else quantity.name
 
 
-def _changes(paper: Paper, told: Contents, rows: list[Change]) -> None:
-    """Write a table of metrics without and with each device."""
+def _banded(quantity: Quantity, bands: Iterable[Any]) -> str:
+    """Return the value of a quantity, with its band where it has one."""
+    band = next((row.band for row in bands if row.name == quantity.name), quantity.text)
+    return quantity.text if band == quantity.text else f"{quantity.text} ({band})"
+
+
+def _table(paper: Paper, told: Contents, rows: list[Change], *, answers: bool = False) -> None:
+    """Write a table of metrics without and with each treatment; among the answers are bands, grades and devices."""
     n = max(1, len(told.treatments))
     first = 0.40 if n < 3 else 0.31
     rest = (1 - first) / (1 + 1.5 * n)
@@ -77,42 +179,33 @@ def _changes(paper: Paper, told: Contents, rows: list[Change]) -> None:
     for row in rows:
         line = [_named(row.before, 0), row.before.text]
         for name, _ in told.treatments:
+            band = _change_band(told, name, row.before.key) if answers else ""
             after = row.after.get(name)
-            line.append(f"{after.text}  {row.of(name)}" if after else "–")
+            line.append(f"{after.text}  {row.of(name)}{band}" if after else "–")
         cells.append(line)
-    head = ("", "Before", *(title for _, title in told.treatments))
-    paper.table(cells, (first, rest, *[1.5 * rest] * len(told.treatments)), head=head)
+    if answers:
+        implants = {name: one.get("implants", {}) for name, one in told.metrics.get("treatments", {}).items()}
+        for key in OF_DEVICE:
+            found = [
+                ", ".join(
+                    f"{Quantity((key,), one[key]).text} {ends(one, key)}".strip()
+                    for one in implants.get(name, {}).values()
+                    if key in one
+                )
+                for name, _ in told.treatments
+            ]
+            if any(found):
+                cells.append([Quantity((key,), 0).name, "–", *(one or "–" for one in found)])
+        grades = {one.name: f"{one.mark} {one.grade}" for one in told.qualities}
+        if grades:
+            cells.append(["Grade of the flow", *(grades.get(name, "–") for name in ("bare", *dict(told.treatments)))])
+    if cells:
+        head = ("", "Before", *(title for _, title in told.treatments))
+        paper.table(cells, (first, rest, *[1.5 * rest] * len(told.treatments)), head=head)
 
 
-def _devices(paper: Paper, told: Contents) -> None:
-    """Write the section of every implant."""
-    for implant in told.implants:
-        paper.heading(implant["title"])
-        paper.text(implant["words"])
-        paper.text(implant["advice"])
-        paper.table(_rows(implant["quantities"], 2), (0.66, 0.34))
-        if implant["how_sure"]:
-            paper.text(implant["how_sure"])
-        if implant["bands"]:
-            cells = [(row.name, row.value, f"{row.low} to {row.high}", row.cause) for row in implant["bands"]]
-            paper.table(cells, (0.34, 0.13, 0.23, 0.30), head=("Result", "Value", "Band (95 %)", "Largest cause"))
-        if implant["facts"]:
-            paper.text("Sources of the device's numbers:", 8, color=QUIET)
-            paper.table(implant["facts"], (0.26, 0.74))
-
-
-def _words(paper: Paper, told: Contents) -> None:
-    """Write notes, limits, definitions and provenance."""
-    paper.heading("Notes and limits")
-    for note in (*told.notes, *told.limits):
-        paper.text(f"• {note}")
-    paper.heading("Definitions")
-    if told.changes:
-        paper.text(OF_PULSE, 8)
-    for definition, unit in told.definitions:
-        source = f" ({definition.source})" if definition.source else ""
-        paper.text(f"{definition.name}{f' [{unit}]' if unit else ''}: {definition.meaning}{source}", 8)
-    paper.heading("Method")
-    for title, lines in told.provenance:
-        paper.text(title, 8.5, color=ACCENT)
-        paper.table(lines, (0.34, 0.66))
+def _change_band(told: Contents, name: str, key: str) -> str:
+    """Return the 95 % interval of a change in brackets, where an uncertainty study has computed it."""
+    study = told.metrics["treatments"][name].get("uncertainty", {})
+    interval = study.get("intervals", {}).get(f"{key}_ratio")
+    return "" if interval is None else f" ({between(*(format_change(1.0, interval[end]) for end in ('low', 'high')))})"

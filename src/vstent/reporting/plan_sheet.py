@@ -7,24 +7,25 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from vstent.anatomy.landing_zones import ZONE_MM, neck_span_mm
+from vstent.anatomy.morphology import morphology
 from vstent.anatomy.restore.paths import on_path
+from vstent.angiography.view import fitted
 from vstent.devices.design import Basket, Coil
 from vstent.devices.stent import Coils, Deployment, Stent
 from vstent.geometry.vessel import Anatomy
 from vstent.plan.criteria import default_criteria
 from vstent.plan.rank import Candidate, alternatives, graded_anew, landing_measures
 from vstent.reporting.figures import Picture, Plate, wire_shots
+from vstent.reporting.page import HASH_DIGITS
 from vstent.reporting.paper import QUIET, Paper
 from vstent.reporting.quantities import format_value
-from vstent.reporting.scene import Implants, scene_of, titled
+from vstent.reporting.scene import Implants, scene_of, titled, views_of
 from vstent.reporting.uncertainty import ends, how_sure
 
 PICTURE_SHARE: Final = 0.19
 """Largest height of the picture as a fraction of the page."""
 MOST_NOTES: Final = 2
 """Largest number of notes on a page; the report has all."""
-HASH_DIGITS: Final = 16
-"""Number of digits of the input's SHA-256 that are printed."""
 SCALES: Final = (1.0, 0.92, 0.84, 0.77, 0.7)
 """Scales of a page, the largest first; the first at which all of it fits is used. Text has 8 points at scale 1."""
 
@@ -51,6 +52,7 @@ def plan_pdf(case: Planned) -> bytes:
     from matplotlib import rc_context
 
     with rc_context({"pdf.fonttype": 42, "font.family": "DejaVu Sans"}):
+        vessel = _vessel_rows(case.anatomy)
         pages = [
             partial(
                 _write,
@@ -59,6 +61,7 @@ def plan_pdf(case: Planned) -> bytes:
                 deployment=deployment,
                 metrics=case.metrics[name][key],
                 picture=_picture(case, name),
+                vessel=vessel,
                 others=_size_rows(case, deployment.stent, case.metrics[name][key]),
             )
             for name, key, title, deployment in titled(case.implants)
@@ -86,6 +89,7 @@ def _write(
     deployment: Deployment,
     metrics: Mapping[str, Any],
     picture: Picture,
+    vessel: Sequence[tuple[str, str]],
     others: Sequence[tuple[str, str, str]],
 ) -> None:
     """Write the page of one implant; `others` are size, score and reason of alternatives."""
@@ -94,8 +98,8 @@ def _write(
         f"Plan of {case.day}. Input SHA-256 {case.source[:HASH_DIGITS]}… Deployed length and fit are predictions."
     )
     paper.picture(picture, most=PICTURE_SHARE)
-    paper.heading("Device and landing")
-    paper.table(_device_rows(case.anatomy, deployment, metrics), (0.62, 0.38))
+    paper.heading("Sac, device and landing")
+    paper.table([*vessel, *_device_rows(case.anatomy, deployment, metrics)], (0.62, 0.38))
     paper.text(how_sure(metrics), 8)
     paper.heading("Warnings and notes")
     warnings = [deployment.advice, *case.anatomy.notes, *case.anatomy.vessel.notes]
@@ -113,6 +117,24 @@ def _picture(case: Planned, name: str) -> Picture:
     scene = scene_of(case.anatomy, {name: case.implants[name]}, {})
     caption = "The device in the patient's artery; the red line is the neck."
     return Plate("plan", "Position", caption, scene, wire_shots(scene, name, "sac")).drawn()
+
+
+def _vessel_rows(anatomy: Anatomy) -> list[tuple[str, str]]:
+    """Return sac size, neck width, parent diameter and the direction of the C-arm that shows the neck in profile."""
+    found, rows = morphology(anatomy), []
+    for words, keys in (
+        ("Sac: largest diameter, height, volume", ("sac_max_diameter_mm", "sac_height_mm", "sac_volume_mm3")),
+        ("Neck width: smallest, largest", ("neck_min_diameter_mm", "neck_max_diameter_mm")),
+        ("Parent artery: diameter proximal, distal", ("parent_proximal_diameter_mm", "parent_distal_diameter_mm")),
+    ):
+        if all(key in found for key in keys):
+            rows.append((words, ", ".join(format_value(key, found[key]) for key in keys)))
+    if anatomy.vessel.is_oriented:
+        profile = views_of(anatomy)[0]
+        x, y, z = profile.axes[2]
+        angles = float(np.arctan2(x, -y)), float(np.arcsin(np.clip(z, -1.0, 1.0)))
+        rows.append(("C-arm for a view in profile", fitted(profile.center_mm[None], angles).name))
+    return rows
 
 
 def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str, Any]) -> list[tuple[str, str]]:

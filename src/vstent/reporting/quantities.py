@@ -45,6 +45,8 @@ Angles, fractions and energies are converted to degrees, percent and µJ for dis
 
 NOTHING = 1e-9
 """Magnitude below which a value is shown as 0, because only rounding errors are that small."""
+FINEST_MM = 0.1
+"""Length below which micrometers are its last digit."""
 RATIO = "_ratio"
 """Suffix of the key of a ratio: value with the device over value without it."""
 MOST_RATIO = 10.0
@@ -160,6 +162,13 @@ def split_unit(key: str) -> tuple[str, str]:
     return key, ""
 
 
+def spoken(words: str) -> str:
+    """Return a sentence of the program as a page says it: no options, openings by name, signs of typography."""
+    words = re.sub(r" \((?:without )?--[^)]*\)", "", words)
+    words = re.sub(r"\b((?:in|out)let)_(?=\d)", r"\1 ", words.replace("+-", "±"))
+    return re.sub(r"(?<=\d)%", "\u202f%", re.sub(r"(?<![\w.\-])-(?=\d)", "−", words))
+
+
 def format_value(key: str, value: Any) -> str:
     """Return a value with the unit in which its key ends: ``0.412 mL/s``; values of a list are parted by commas."""
     if isinstance(value, (list, tuple)):
@@ -172,7 +181,10 @@ def format_value(key: str, value: Any) -> str:
         return value
     unit, factor = UNITS.get(split_unit(key)[1], ("", 1.0))
     whole = factor == 1.0 and (isinstance(value, int) or key.endswith("_count"))
-    number = f"{value:.0f}" if whole else format_number(value * factor)
+    number = (f"{value:.0f}" if whole else format_number(value * factor)).removeprefix("-")
+    if unit == "mm" and abs(value) < FINEST_MM:
+        number = f"{abs(value):.3f}".rstrip("0").rstrip(".")
+    number = f"−{number}" if value < 0 and number != "0" else number
     return f"{number}\u202f{unit}" if unit else number
 
 
@@ -189,20 +201,24 @@ def format_number(value: float) -> str:
 def format_change(before: Any, after: Any, key: str = "") -> str:
     """Return a relative change in percent, such as ``−35 %``; a dash where it is undefined.
 
-    The change of a percentage is a difference in percentage points, such as ``+1.2 points``. The change from zero, or
+    The change of a percentage is a difference, such as ``+1.2 percentage points``. The change from zero, or
     to more than ten times the value, is a difference with the unit in which the key ends, such as ``+39.8 mm³``.
     """
     if not all(isinstance(value, (int, float)) and math.isfinite(value) for value in (before, after)):
         return "–"
     if unit_of(key) == "%":
-        return f"{100 * (after - before):+.2g}\u202fpoints".replace("-", "−")
+        return f"{_signed(100 * (after - before))} percentage points"
     if abs(after) > MOST_RATIO * abs(before):
         return f"{'+' if after > before else ''}{format_value(key, after - before)}".replace("-", "−") if key else "–"
     if before == 0:
         return "–"
-    percent = 100 * (after / before - 1)
-    digits = 0 if abs(percent) >= 10 else 1
-    return f"{percent:+.{digits}f}\u202f%".replace("-", "−")
+    return f"{_signed(100 * (after / before - 1))}\u202f%"
+
+
+def _signed(percent: float) -> str:
+    """Return a percentage with its sign, and one decimal below 10; without a sign where it rounds to 0."""
+    text = f"{percent:+.{0 if abs(percent) >= 10 else 1}f}".replace("-", "−")
+    return text[1:] if text[1:] == "0.0" else text
 
 
 def flatten(metrics: Any, path: tuple[str, ...] = ()) -> list[Quantity]:

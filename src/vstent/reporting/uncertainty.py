@@ -42,6 +42,8 @@ class Row(NamedTuple):
     """Lower end, with unit."""
     high: str
     """Upper end, with unit."""
+    band: str
+    """Both ends with the unit once, such as ``14.7 to 19.1 mm``; one where they are alike."""
     cause: str
     """Number of the device that contributes most, with its share of the variance; empty where there is none."""
 
@@ -58,8 +60,15 @@ def band_rows(implant: Mapping[str, Any]) -> list[Row]:
     for key, band in implant.get("bands", {}).get("results", {}).items():
         low, high = (format_value(key, band[end]) for end in ("low", "high"))
         cause = f"{number_name(band['cause'])} {100 * band['cause_fraction']:.0f}\u202f%" if "cause" in band else ""
-        found.append(Row(Quantity((key,), 0.0).name, format_value(key, implant.get(key)), low, high, cause))
+        value = format_value(key, implant.get(key))
+        found.append(Row(Quantity((key,), 0.0).name, value, low, high, between(low, high), cause))
     return found
+
+
+def between(low: str, high: str) -> str:
+    """Return two values with their unit once, such as ``14.7 to 19.1 mm``; one value where they are alike."""
+    number, *_ = low.split("\u202f")
+    return low if low == high else f"{number} to {high}"
 
 
 def ends(implant: Mapping[str, Any], key: str) -> str:
@@ -68,8 +77,7 @@ def ends(implant: Mapping[str, Any], key: str) -> str:
     if band is None:
         return ""
     low, high = (format_value(key, band[end]) for end in ("low", "high"))
-    number, _, unit = low.partition("\u202f")
-    return "" if low == high else f"({number if unit else low} to {high})"
+    return "" if low == high else f"({between(low, high)})"
 
 
 def how_sure(implant: Mapping[str, Any], title: str = "", *, is_repeated: bool = False) -> str:
@@ -108,6 +116,8 @@ class Interval(NamedTuple):
     """Lower end of the 95 % interval, with unit."""
     high: str
     """Upper end of the 95 % interval, with unit."""
+    band: str
+    """Both ends, with the unit once."""
     shares: list[tuple[str, float]]
     """Causes and their shares in the variance, the largest first."""
 
@@ -130,7 +140,8 @@ def intervals(treatment: Mapping[str, Any]) -> list[Interval]:
         names = [(cause.removesuffix("_fraction"), share) for cause, share in varied["shares"][key].items()]
         shares = [(CAUSES.get(cause) or number_name(cause), share) for cause, share in names]
         mean, low, high = (format_value(key, interval[end]) for end in ("mean", "low", "high"))
-        found.append(Interval(Quantity((key,), 0.0).name, mean, low, high, sorted(shares, key=lambda part: -part[1])))
+        ordered = sorted(shares, key=lambda part: -part[1])
+        found.append(Interval(Quantity((key,), 0.0).name, mean, low, high, between(low, high), ordered))
     return found
 
 

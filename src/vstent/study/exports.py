@@ -47,7 +47,8 @@ def export_openfoam(path: Path, out: Path, settings: Settings, foam: Mapping[str
     with store.stage("export") as tell:
         written = foam_case(case, setup)
         write(out, written)
-        tell(f"{len(written.files)} files for {written.application}, grid spacing {setup.cell_size_mm:.3g} mm.")
+        held = " The outlet flows are those without the device: see README." if stents and case.resistances else ""
+        tell(f"{len(written.files)} files for {written.application}, grid spacing {setup.cell_size_mm:.3g} mm.{held}")
 
 
 def export_patches(path: Path, out: Path, settings: Settings, progress: OnProgress) -> list[dict[str, Any]]:

@@ -31,6 +31,7 @@ from vstent.flow.lattice.stepping import twin
 from vstent.flow.media import media
 from vstent.flow.problem import flow_case
 from vstent.flow.settings import FlowSettings, Numerics
+from vstent.flow.simulation import simulate_case
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.archive import load_data, save_data
 
@@ -98,6 +99,31 @@ def test_an_exchanged_device_comes_to_its_own_flow(live: LiveFlow) -> None:
     for one in (sparse, dense, (), dense):
         live.place(one)
         np.testing.assert_allclose(settled(live), alone(live, one), rtol=0.03)
+
+
+def test_a_covered_branch_loses_as_much_as_its_resistance_says() -> None:
+    """A branch beside the sac: live and full computation agree on what the device leaves of its flow."""
+    straight = phantoms.with_sac(phantoms.tube(length_mm=28.0), abscissa_mm=14.0, width_mm=5.0, neck_mm=3.6)
+    phantom = phantoms.with_branch(straight, abscissa_mm=14.0, direction=[-1, 0, 0.6], radius_mm=1.0, length_mm=9.0)
+    branched = restore(trace(Vessel(phantoms.phantom_surface(phantom, edge_mm=0.3))))
+    settings = replace(SETTINGS, outlets="resistance", mean_pressure_mmHg=20.0)
+    bare = flow_case(branched, (), settings)
+    silk = media(vstent.deploy("silk", branched).stent, bare.blood)
+    dense = tuple(replace(one, normal_resistance_Pa_s_m=40 * one.normal_resistance_Pa_s_m) for one in silk)
+    live = LiveFlow(bare)
+    live.place(dense)
+    while not live.read().is_settled or not live.bare.is_settled:
+        live.advance(0.5)
+    bare = replace(bare, numerics=replace(SETTINGS.numerics, cell_size_mm=live.cell_size_mm))
+    first = simulate_case(bare)
+    after = simulate_case(replace(bare, media=dense), start=first)
+    in_branch = [sorted(one.readings[-1][2:].reshape(2, -1)[1])[-2] for one in (live._bare, live._shown)]
+    left = after.outlets_mL_s[1] / first.outlets_mL_s[1]
+    before, now = (indices(one, bare.sac, bare.ostium)["neck_inflow_mL_s"] for one in (first, after))
+    assert left < 0.95
+    assert in_branch[1] / in_branch[0] == pytest.approx(left, abs=0.02)
+    change, band = live.change("neck_inflow_mL_s")
+    assert change == pytest.approx(100 * (now / before - 1), abs=6 + band)
 
 
 def test_both_flows_step_until_the_one_without_a_device_is_known(live: LiveFlow) -> None:

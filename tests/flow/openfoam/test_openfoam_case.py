@@ -243,7 +243,8 @@ def test_resistances_prescribe_the_flow_without_a_device() -> None:
     assert velocity["outlet_2"]["type"] == ["flowRateOutletVelocity"]
     asked = case("resistance").resistances[1].mean_mL_s
     np.testing.assert_allclose(pairs(files["constant/flow_outlet_2"])[:, 1], 1e-6 * asked)
-    assert "The outlets have resistances." in files["README"]
+    whole = [f"outlet_{k} {end.at(0.0):.4g}" for k, end in enumerate(case("resistance").resistances, start=1)]
+    assert f"with a device, correct them by this formula. R in Pa s/mL: {', '.join(whole)}.\n" in files["README"]
     assert "resistances" not in foam_case(case(), SETUP).files["README"]
 
 

@@ -2,7 +2,8 @@
 
 The sac and a piece of the artery are computed on a fine grid, inside the flow of the whole vessel on a coarse grid
 (`close_up`). The coarse flow is computed once, without a device, until the blood of the vessel has been exchanged: a
-device changes the flow of the artery far less than that of the neck. Both lattices then step in turn. Every value is
+device changes the flow of the artery far less than that of the neck. With resistances at the outlets, the flow out
+of the refined region follows the pressure there. Both lattices then step in turn. Every value is
 known at any time with an uncertainty, which falls while the flow develops and its averages grow longer.
 
 The flow without a device can be computed in advance (`LiveFlow.prepare`) and stored (`LiveFlow.stored`). Only the
@@ -19,13 +20,15 @@ import numpy as np
 
 from vstent.flow.case import FlowCase, FlowField, Level, Sheet, Target
 from vstent.flow.domain import default_cell_size_mm, extended_volume_mm3
+from vstent.flow.ends import Resistance, outflows
 from vstent.flow.engines import DivergenceError, Outcome, Saved, stepped
 from vstent.flow.indices import neck_diameter_mm, parent_diameter_mm
 from vstent.flow.lattice.checkpoint import pack
 from vstent.flow.lattice.close_up import WIDTH, require_sac
 from vstent.flow.lattice.engine import LatticeBoltzmann, trouble
+from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.state import NECK_INFLOW, Snapshot, State
-from vstent.flow.lattice.stepping import advance, exchange, monitored, snapshot, twin
+from vstent.flow.lattice.stepping import FOLLOWED, advance, exchange, monitored, snapshot, twin
 from vstent.flow.stopping import SURE, fraction_left, standard_error
 from vstent.kernels.arrays import Floats
 from vstent.units import M3_PER_ML, M_PER_MM
@@ -86,13 +89,14 @@ class BareFlow:
     saved: Saved
     """State of the lattice in the refined region (see `checkpoint.pack`)."""
     readings: Floats
-    """(n, 2) neck inflow in mL/s and sac velocity in m/s at equal intervals of time."""
+    """(n, 2 + 2 k) values read at equal intervals of time (see `Stepping.readings`)."""
 
 
 class Stepping:
     """A lattice and the values read from it since its device was placed.
 
-    Readings are `reading_steps` time steps apart, an even number.
+    Readings are `reading_steps` time steps apart, an even number: neck inflow in mL/s, sac velocity in m/s, and for
+    each of k ends of the grid the pressure in Pa and then the flow rate out in mL/s.
     """
 
     def __init__(self, state: State, reading_steps: int) -> None:
@@ -111,8 +115,28 @@ class Stepping:
         self._read = None
 
     def _values(self, now: Snapshot) -> Floats:
-        """Return neck inflow and mean speed in the sac."""
-        return monitored(self.state, now)[[NECK_INFLOW, 0]]
+        """Return the values of a reading."""
+        domain, pressure_Pa = self.state.domain, now.pressure_Pa
+        at_ends_Pa = [pressure_Pa[domain.link_cell[domain.link_patch == k]].mean() for k in self.state.links.patch]
+        return np.concatenate([monitored(self.state, now)[[NECK_INFLOW, 0]], at_ends_Pa, now.outflow_mL_s])
+
+    def answer(self, bare: Floats, common_Pa: float) -> None:
+        """Let the flow out through every end follow its pressure, with the resistance of a flow without a device.
+
+        `bare` is a reading of that, and `common_Pa` the pressure common to its outlets. What lies between an end and
+        its outlets is part of the resistance.
+        """
+        links, scales = self.state.links, self.state.scales
+        leaves = np.flatnonzero(~links.is_inflow)
+        before_Pa, before_mL_s = bare[2:].reshape(2, -1)[:, leaves]
+        ends = [
+            Resistance(flow_mL_s, common_Pa, resistance_Pa_s_mL=(common_Pa + pressure_Pa) / flow_mL_s)
+            for pressure_Pa, flow_mL_s in zip(before_Pa.tolist(), before_mL_s.tolist(), strict=True)
+        ]
+        now_Pa = self.readings[-1][2:].reshape(2, -1)[0, leaves]
+        flow_mL_s = outflows(ends, before_mL_s.sum(keepdims=True), now_Pa[None])[0][0]
+        wanted = flow_mL_s / scales.flow_mL_s / links.openings[leaves, d3q19.AREA]
+        links.course[0, leaves] += FOLLOWED * (wanted - links.wanted[leaves] - links.course[0, leaves])
 
     def forget(self) -> None:
         """Forget all readings."""
@@ -123,7 +147,7 @@ class Stepping:
         """Return the averages of neck inflow and sac velocity."""
         if self._read is None:
             values = np.array(self.readings or [self._values(snapshot(self.state))])
-            (inflow, inflow_error), (velocity, velocity_error) = (known(column) for column in values.T)
+            (inflow, inflow_error), (velocity, velocity_error) = map(known, values.T[:2])
             errors = {"neck_inflow_mL_s": inflow_error, "sac_velocity_m_s": velocity_error}
             self._read = Reading(inflow, velocity, errors)
         return self._read
@@ -220,6 +244,9 @@ class LiveFlow:
             for one in self._unknown:
                 one.advance()
                 done += one.reading_steps
+                if self.case.resistances and one is not self._bare and self._bare.readings:
+                    bare = np.mean(list(self._bare.readings)[-LATEST:], axis=0)
+                    one.answer(bare, self.outer.common_pressure_Pa)
         return done
 
     def prepare(self, seconds: float) -> None:

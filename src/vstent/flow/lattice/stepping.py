@@ -155,7 +155,8 @@ def twin(state: State) -> State:
     """Return a second run with the same flow, which goes its own way."""
     if state.device is not None:
         state.device.fetch(state)
-    links = replace(state.links, source=state.links.source.copy(), openings=state.links.openings.copy())
+    changing = {name: getattr(state.links, name).copy() for name in ("source", "openings", "course")}
+    links = replace(state.links, **changing)
     refill = replace(state.refill, lost=state.refill.lost.copy(), refill=state.refill.refill.copy())
     return replace(
         state,

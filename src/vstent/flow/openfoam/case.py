@@ -21,8 +21,10 @@ SCRIPTS: Final = ("Allrun", "Allclean", "submit.slurm")
 
 
 RESISTING_NOTE: Final = """\
-The outlets have resistances. constant/flow_outlet_2, ... hold the flow without a device; outlet_1 takes the rest.
-With a device, vstent run --engine openfoam adjusts these files between its checks. ./Allrun does not.
+The outlets have resistances, but this case imposes flows: constant/flow_outlet_2, ... hold those without a device,
+and outlet_1 takes the rest. A device changes them: Q = (P + p) / R with the mean pressure p of an outlet in Pa, and P
+such that as much leaves as enters. vstent run --engine openfoam adjusts these files between its checks. ./Allrun does
+not: with a device, correct them by this formula. R in Pa s/mL: $resistances.
 """
 """What the README says of resistances: OpenFOAM itself would need a compiler for them."""
 
@@ -79,6 +81,8 @@ def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
         before = "[ -d processor0 ] || decomposePar > log.decomposePar 2>&1\n"
         solve = f"mpirun -np {setup.processes} {application} -parallel"
         after = "reconstructPar -latestTime > log.reconstructPar 2>&1\n"
+    named = zip(case.vessel.outlets, case.resistances, strict=False)
+    resistances = ", ".join(f"{outlet.role} {end.at(0.0):.4g}" for outlet, end in named)
     values = {
         "before": before,
         "solve": solve,
@@ -90,7 +94,7 @@ def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
         "inlets": ", ".join(inlet.role for inlet in case.vessel.inlets),
         "density": f"{case.blood.density_kg_m3:.6g}",
         "inflow": f"{case.inflow_mL_s:.6g}",
-        "resisting": RESISTING_NOTE if case.resistances else "",
+        "resisting": Template(RESISTING_NOTE).substitute(resistances=resistances) if case.resistances else "",
     }
     texts = {
         name: (resources.files(__package__) / "exported" / name).read_text(encoding="utf-8")
