@@ -202,7 +202,10 @@ def test_only_a_case_of_the_workspace_is_deleted(client, workspace, tmp_path_fac
 
 SIZES = [
     (1024, 768),
-    *(pytest.param(size, marks=pytest.mark.validation) for size in [(1920, 1080), (1366, 768), (768, 1024)]),
+    *(
+        pytest.param(size, marks=pytest.mark.validation)
+        for size in [(1920, 1080), (1366, 768), (768, 1024), (720, 450)]
+    ),
 ]
 OUTSIDE = """() => {
     const [w, h] = [innerWidth, innerHeight];
@@ -231,6 +234,7 @@ def test_every_step_fits_and_is_accessible(client, size):
             step(page, title)
             page.wait_for_timeout(1500)
             assert page.evaluate(OUTSIDE) == [], title
+            assert re.findall(r"outlet_\d|zero_pressure|\(--|\bTrue\b|\s-\d", page.inner_text("#app")) == [], title
             assert serious(page) == [], title
         page.locator(".brand").click()
         page.wait_for_selector(".recent-card")

@@ -142,6 +142,9 @@ def test_command_line_rest_and_python_find_the_same_numbers(client, case, artery
     assert by_rest["treatments"]["silk"]["implants"]["silk"]["deployed_length_mm"] > 10
     report = client.get(f"{case}/files/report.html")
     assert "Silk" in report.text
+    proposed = client.get(f"{case}/proposed").json()
+    assert proposed["cost"].startswith("Grid spacing")
+    assert proposed["inflow_source"].startswith("assumed")
     assert "sandbox" in report.headers["content-security-policy"]
 
 
@@ -159,6 +162,8 @@ def test_voxels_without_a_header_wait_for_their_number_and_size(client):
         assert not choose(client, case, spacing_mm=spacing_mm, shape=[16, 20, 24]).json()["wants_grid"]
         told = client.get(f"{case}/image").json()
         assert (told["shape"], told["spacing_mm"]) == ([16, 20, 24], pytest.approx(spacing_mm))
+    waiting = client.post(f"{case}/input/done", params={"look_first": True}).json()
+    assert (waiting["job"], waiting["steps"]["image"]) == (None, "todo")
 
 
 def test_a_case_takes_one_scan(client, case, artery):
@@ -626,6 +631,9 @@ def test_a_failure_is_told_while_what_caused_it_is_chosen(client, case):
     failed = app_case.wait(client, case.rpartition("/")[2])
     assert "unheard-of" in failed["failed"]["flow"]
     assert failed["steps"]["flow"] == "failed"
+    listed = client.get("/api/cases").json()["cases"]
+    assert [one["changed_s"] for one in listed] == sorted((one["changed_s"] for one in listed), reverse=True)
+    assert [(one["failed"], one["job"]) for one in listed if one["id"] == failed["id"]] == [(["flow"], "")]
     chosen = choose(client, case, treatments=[SILK]).json()
     assert chosen["failed"] == {}
     assert "failed" not in chosen["steps"].values()
@@ -735,6 +743,10 @@ def test_a_study_of_two_implants_opens_with_its_flow_and_numbers(flown, tmp_path
         assert [implant["inside"] for implant in treatment["implants"]] == [[], ["silk"]]
         assert treatment["implants"][1]["placing"]["shift_mm"] == -4.0
         assert app_case.opened(client.get(f"{case}/flow"))[0]["panes"] == ["bare", "silk+silk_2"]
+        moved, _ = app_case.opened(client.get(f"{case}/flow", params={"cut_mm": 0.5}))
+        assert [(layer["id"], layer["pane"]) for layer in moved["layers"]] == [
+            ("slice", name) for name in moved["panes"]
+        ]
         numbers = client.get(f"{case}/numbers").json()
         (flow,) = numbers["flow"]
         assert numbers["ranking"] == [ranked]

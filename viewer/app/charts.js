@@ -187,7 +187,11 @@ export function pulseChart({ time_s, factor }, isPulsatile, times, moment, chose
 
 /** Amounts of contrast over time, one line per flow and region, with the time of the film; a click chooses a time. */
 export function curvesChart(curves, now, [width, height], title, chosen) {
-  const [left, right, top, bottom] = [46, 14, 24, 24];
+  const [left, right, bottom] = [46, 14, 24];
+  const [lines, signs] = [[[]], [...curves].reverse().map(({ name, region }) => ({ name, words: `${region === "sac" ? "—" : "┄"} ${title(name)}, ${region}` }))];
+  const long = (line) => line.reduce((sum, { words }) => sum + 6.6 * words.length + 10, 0);
+  for (const sign of signs) (long([...lines.at(-1), sign]) < width - left - 60 || !lines.at(-1).length ? lines.at(-1) : lines[lines.push([]) - 1]).push(sign);
+  const top = 11 + 13 * lines.length;
   const last = Math.max(...curves.map(({ time_s }) => time_s.at(-1)));
   const most = 1.08 * Math.max(1e-9, ...curves.flatMap(({ values }) => values));
   const x = (t) => left + ((width - left - right) * t) / last;
@@ -195,17 +199,12 @@ export function curvesChart(curves, now, [width, height], title, chosen) {
   const parts = ticks(0, most, 3).flatMap((v) => level(y(v), left, width - right, String(v)));
   for (const t of ticks(0, last, Math.max(4, width / 110))) parts.push(text(x(t), height - 7, `${t} s`, { class: "tick middle" }));
   parts.push(text(4, 13, curves[0].unit, { class: "axis-title" }));
-  let place = width - right;
   const names = [...new Set(curves.map(({ name }) => name))];
   for (const { name, region, time_s, values } of curves) {
     const style = `line curve flow-${names.indexOf(name)} ${region}`;
     parts.push(svg("path", { d: path(time_s.map((t, i) => [x(t), y(values[i])])), class: style }));
   }
-  for (const { name, region } of [...curves].reverse()) {
-    const words = `${region === "sac" ? "—" : "┄"} ${title(name)}, ${region}`;
-    parts.push(text(place, 13, words, { class: `tick end flow-${names.indexOf(name)}` }));
-    place -= 6.6 * words.length + 10;
-  }
+  lines.forEach((line, k) => line.forEach(({ name, words }, i) => parts.push(text(width - right - long(line.slice(0, i)), 13 + 13 * k, words, { class: `tick end flow-${names.indexOf(name)}` }))));
   parts.push(svg("line", { x1: x(now), x2: x(now), y1: top, y2: height - bottom, class: "cursor" }));
   const chart = svg("svg", { class: "chart", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": "Contrast over time" }, parts);
   chart.addEventListener("click", (event) => chosen(((event.clientX - chart.getBoundingClientRect().left - left) / (width - left - right)) * last));

@@ -201,6 +201,12 @@ class Page {
     this.shape = shape;
     this.imaging.follow(view);
     this.render();
+    if (this.proposed && JSON.stringify(before.choices.flow) !== JSON.stringify(view.choices.flow)) this.propose().catch(this.complain);
+  }
+
+  /** Ask for what is proposed, and what the flow costs, with the present choices. */
+  async propose() {
+    this.show({ proposed: await get(`${this.path}/proposed`) });
   }
 
   /** Go along with a job through its steps; the state in which a short one runs may never have come. */
@@ -277,8 +283,7 @@ class Page {
       this.measures = {};
       this.render(); // the picture does not wait for the numbers
       this.sheets = await get(`${this.path}/numbers`);
-      this.proposed = await get(`${this.path}/proposed`);
-      this.render();
+      await this.propose();
       this.portrait.take(this.anatomyKey);
     } catch (problem) {
       this.complain(problem);
@@ -296,6 +301,13 @@ class Page {
     } catch (problem) {
       this.complain(problem);
     }
+  }
+
+  /** Move the slice of the flow. */
+  askSlice() {
+    const moment = this.moment === undefined ? "" : `&moment=${this.moment}`;
+    this.slices ??= new Newest((answer) => this.picture.put(answer), this.complain);
+    this.slices.ask(() => getBinary(`${this.path}/flow?cut_mm=${this.memory.cut}${moment}`));
   }
 
   // -- what is drawn anew when something has changed ----------------------------------------------------------------
@@ -502,7 +514,7 @@ class Page {
     const stop = button("Cancel", () => drop(`${this.path}/jobs`).catch(this.complain));
     const done = job.finished.map(({ stage }) => this.spoken(stage));
     const said = make("p", { className: "hint" }, [done.length ? `Done: ${done.join(", ")}.` : "The work continues when this tab is closed."]);
-    redraw(this.work, words, make("div", { className: "bar", role: "progressbar", ariaValueNow: String(Math.round(100 * job.fraction)) }, [bar]), stop, said);
+    redraw(this.work, words, make("div", { className: "bar", role: "progressbar", ariaLabel: "Progress of the work", ariaValueNow: String(Math.round(100 * job.fraction)) }, [bar]), stop, said);
   }
 
   renderNumbers() {
@@ -577,7 +589,8 @@ class Page {
       this.moments.ask(() => this.loadFlow());
     };
     const save = chartButton("inlet waveform", box);
-    const draw = () => box.replaceChildren(save, pulseChart(this.pulse, this.view.choices.flow.is_pulsatile, this.times || [], this.moment, shown));
+    const rate = () => make("p", { className: "hint" }, [this.view.choices.flow.is_pulsatile ? `Heart rate ${(60 / this.pulse.time_s.at(-1)).toFixed(0)}/min.` : ""]);
+    const draw = () => box.replaceChildren(save, rate(), pulseChart(this.pulse, this.view.choices.flow.is_pulsatile, this.times || [], this.moment, shown));
     if (this.pulse) draw();
     else get(`/api/waveform?case_id=${this.view.id}`).then((pulse) => ((this.pulse = pulse), draw())).catch(this.complain);
     return box;
@@ -694,10 +707,16 @@ class Page {
   }
 }
 
+/** A time that is estimated, no finer than it is known. */
+function timeLeft(seconds) {
+  if (seconds < 10) return "a few seconds left";
+  return seconds < 90 ? `about ${10 * Math.round(seconds / 10)} s left` : `about ${Math.round(seconds / 60)} min left`;
+}
+
 /** What a job does, how far its flow is from convergence, and how long it will take. */
 function progressWords({ detail, residual, seconds_left }) {
   const away = residual === null ? "" : `${(100 * residual).toFixed(1)} % from convergence`;
-  return [detail, away, seconds_left === null ? "" : `${seconds_left.toFixed(0)} s left`].filter(Boolean).join(", ");
+  return [detail, away, seconds_left === null ? "" : timeLeft(seconds_left)].filter(Boolean).join(", ");
 }
 const SPOKEN = {
   scan: "Scan", vessel: "Vessel", segment: "Wall", trace: "Centerlines", trim: "Trimming", restore: "Parent artery and sac", anatomy: "Anatomy", rank: "Sizes", rank_flow: "Flow of the best sizes",

@@ -63,7 +63,8 @@ export function rankedSheet(ranked, named) {
 /** Two numbers with their unit said once. */
 function span(low, high) {
   const [digits, unit] = low.split("\u202f");
-  return unit && high.endsWith(unit) ? `${digits} – ${high}` : `${low} – ${high}`;
+  if (low === high) return low;
+  return unit && high.endsWith(unit) ? `${digits} to ${high}` : `${low} to ${high}`;
 }
 
 /** Uncertainty of the results of a device: mean, 95 % interval and main causes. */
@@ -98,7 +99,7 @@ export function placeWords({ length_mm, width_mm, ends_mm, is_basket, is_coils, 
   const reach = (name, i) => [name, reachWords(i, ends_mm[i], neck ?? neckOfParent), "", reachOf(i, ends_mm[i], neck ?? neckOfParent) < 0];
   const rows = is_basket
     ? [["Width × height", `${width_mm.toFixed(1)} × ${length_mm.toFixed(1)} mm`, ""], ["Lower end", heightWords(ends_mm[0]), ""]]
-    : [["Deployed length", `${length_mm.toFixed(1)} mm`, low ? `${low} to ${high}${cause ? `: ${cause}` : ""}` : ""], reach("Proximal end", 0), reach("Distal end", 1)];
+    : [["Deployed length", `${length_mm.toFixed(1)} mm`, low ? `${span(low, high)}${cause ? `: ${cause}` : ""}` : ""], reach("Proximal end", 0), reach("Distal end", 1)];
   return rows.map(([name, value, range, isShort]) => make("div", { className: "row" }, [make("span", {}, [name]), make("b", { className: isShort ? "bad" : "" }, [value]), make("small", {}, [range])]));
 }
 
@@ -106,7 +107,7 @@ export function placeWords({ length_mm, width_mm, ends_mm, is_basket, is_coils, 
 export function bandWords(sheet) {
   if (!sheet) return [];
   const rows = sheet.rows.map(([name, value, low, high, cause]) =>
-    make("div", { className: "row" }, [make("span", {}, [name]), make("b", {}, [value]), make("small", {}, [`${low} to ${high}${cause ? `: ${cause}` : ""}`])]),
+    make("div", { className: "row" }, [make("span", {}, [name]), make("b", {}, [value]), make("small", {}, [`${span(low, high)}${cause ? `: ${cause}` : ""}`])]),
   );
   const details = make("details", {}, [make("summary", {}, ["Bands from the ranges of the device's numbers"]), ...rows]);
   return [make("p", { className: "hint" }, [sheet.sentence]), ...(rows.length ? [details] : [])];

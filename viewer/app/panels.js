@@ -59,7 +59,7 @@ function unseen(page) {
 
 const main = (words, act, disabled = false) => button(words, act, { className: "primary wide", disabled });
 
-const next = (page, step, words) => button(words, () => page.go(step), { className: "wide next" });
+const next = (page, step, words, isMain = false) => button(words, () => page.go(step), { className: `wide next ${isMain ? "primary" : ""}` });
 
 /** An input or a list with its label and unit; `key` finds it again when it is drawn anew. */
 function field(key, label, unit, input, className = "field") {
@@ -68,9 +68,9 @@ function field(key, label, unit, input, className = "field") {
   return make("label", { className, htmlFor: input.id }, [make("span", {}, label), input, make("small", {}, [unit])]);
 }
 
-function number(key, label, unit, value, changed, { placeholder = "", step = "any", min = "" } = {}) {
+function number(key, label, unit, value, changed, { placeholder = "", step = "any", min = "", usual = "proposed" } = {}) {
   const input = make("input", { type: "number", value: value ?? "", placeholder, step, min, onChange: () => changed(input.value === "" ? null : Number(input.value)) });
-  const mark = value === null || value === undefined ? [make("em", { className: "proposed" }, ["proposed"])] : [];
+  const mark = value === null || value === undefined ? [make("em", { className: "proposed" }, [usual])] : [];
   return field(key, [label, ...mark], unit, input);
 }
 
@@ -204,15 +204,20 @@ export const panels = {
     if (page.asksForAneurysm) return [...title("Blood flow", "The flow without a device, then with each."), question(page)];
     const parts = [...title("Blood flow", "The flow without a device, then with each. All pictures share one camera and one scale.")];
     parts.push(
-      number("inflow", "Mean inflow", "mL/s", flow.inflow_mL_s, (value) => page.chooseFlow({ inflow_mL_s: value }), { min: leastOf(page, "inflow_mL_s"), placeholder: proposal(page.proposed?.inflow_mL_s, 2) }),
+      number("inflow", "Mean inflow", "mL/s", flow.inflow_mL_s, (value) => page.chooseFlow({ inflow_mL_s: value }), { min: leastOf(page, "inflow_mL_s"), placeholder: proposal(page.proposed?.inflow_mL_s, 2), usual: "assumed" }),
+      ...inflowWords(page),
       number("cell", "Grid spacing", "mm", flow.cell_size_mm, (value) => page.chooseFlow({ cell_size_mm: value }), { min: leastOf(page, "cell_size_mm"), step: 0.01, placeholder: proposal(page.proposed?.cell_size_mm, 3) }),
       select("pulse", "Inlet", flow.is_pulsatile ? "1" : "", [["", "steady, at the mean"], ["1", "pulse of the carotid"]], (value) => page.chooseFlow({ is_pulsatile: Boolean(value) })),
       select("outlets", "Outlets", flow.outlets, (page.fields.outlets?.enum ?? [flow.outlets]).map((word) => [word, OUTLETS[word] ?? word.replaceAll("_", " ")]), (value) => page.chooseFlow({ outlets: value })),
     );
     parts.push(page.pulseChart(), ...unseen(page), ...state(page));
-    if (!job) parts.push(main(steps.flow === "done" ? "Run again" : "Run the flow", () => page.start("flow"), !page.view.has_anatomy || !page.treatment));
-    if (page.flowPanes?.length) parts.push(modes(page), ...films(page));
-    if (page.view.has_report && steps.report === "done") parts.push(next(page, "report", "Report →"));
+    const isDone = steps.flow === "done";
+    const run = () => page.start("flow");
+    if (!job && !isDone && page.proposed?.cost) parts.push(make("p", { className: "hint" }, [page.proposed.cost]));
+    if (!job && isDone) parts.push(button("Run again", run, { className: "wide", disabled: !page.treatment }));
+    else if (!job) parts.push(main("Run the flow", run, !page.view.has_anatomy || !page.treatment));
+    if (page.flowPanes?.length) parts.push(modes(page), ...depth(page), ...films(page));
+    if (page.view.has_report && steps.report === "done") parts.push(next(page, "report", "Report →", true));
     return parts;
   },
 
@@ -347,7 +352,7 @@ function parentOutlet(page) {
     const opening = openings.find((one) => one.role === role);
     page.choose({ outlet_mm: opening ? placeOf(opening) : null });
   };
-  const proposed = found && !given ? `${found.replace("_", " ")} (proposed)` : "proposed";
+  const proposed = found && !given ? `${found.replace("_", " ")}, proposed` : "proposed";
   return select("outlet", "Parent leads to", (given && nearest(ends, given)?.role) || "", [["", proposed], ...outlets], chosen);
 }
 
@@ -542,6 +547,27 @@ function films(page) {
     make("p", { className: "hint" }, ["Contrast agent is carried through every flow, and filmed as on an angiography unit."]),
     main("Compute the angiogram", () => page.start("angiogram"), isOff),
   ];
+}
+
+/** The mean inflow in mL/min, and where it comes from if it is not given. */
+function inflowWords({ proposed, view }) {
+  const given = view.choices.flow.inflow_mL_s;
+  const flow = given ?? proposed?.inflow_mL_s;
+  return flow ? [make("p", { className: "hint" }, [`${(60 * flow).toFixed(0)} mL/min${given ? "" : `, ${proposed.inflow_source}`}`])] : [];
+}
+
+/** Where the slice lies, across the profile. */
+function depth(page) {
+  if (page.memory.mode !== "slice") return [];
+  const value = page.memory.cut ?? 0;
+  const words = make("b", {}, [`${value.toFixed(1)} mm`]);
+  const onInput = () => {
+    page.memory.cut = Number(slider.value);
+    words.textContent = `${page.memory.cut.toFixed(1)} mm`.replace("-", "−");
+    page.askSlice();
+  };
+  const slider = make("input", { type: "range", min: -6, max: 6, step: 0.2, value, id: "field-cut", data: { key: "cut" }, onInput });
+  return [make("label", { className: "slider", htmlFor: "field-cut" }, [make("span", {}, ["Slice from the sac's middle ", words]), slider])];
 }
 
 const MODES = [["streamlines", "Streamlines"], ["slice", "Slice"], ["shear", "Wall shear stress"], ["sac_shear", "Shear stress, sac"], ["angiogram", "Angiogram"]];

@@ -271,6 +271,7 @@ export class Picture {
     }
     this.makeRoom();
     const count = this.visiblePanes().length;
+    this.element.classList.toggle("three", count === 3 && width < NARROW);
     this.grid.classList.toggle("four", count === 4 || (count === 3 && width < NARROW));
     this.grid.classList.toggle("alone", count === 1);
     const places = this.visiblePanes().map(({ id, element }) => ({
@@ -325,7 +326,7 @@ export class Picture {
       const { offsetWidth: w, offsetHeight: h } = mark.element;
       const [x, y] = mark.at;
       const left = Math.min(Math.max(x + w + 14 > width ? x - w - 18 : x, 0), Math.max(width - w - 12, 0));
-      let middle = Math.min(Math.max(y, top), height - h);
+      let middle = Math.min(Math.max(y, top), height - h - 36); // above the length bar
       for (const other of taken) if (left < other.right && left + w > other.left && middle < other.bottom + h / 2 + 3) middle = other.bottom + h / 2 + 3;
       taken.push({ left, right: left + w, bottom: middle + h / 2 });
       mark.element.style.transform = `translate(${left}px, ${middle}px)`;

@@ -237,7 +237,7 @@ export class SliceView {
       }
       this.stroke(context, this.lines.path, matrix, LINES.threshold);
     }
-    if (this.outlines?.index !== this.index) return;
+    if (slab || this.outlines?.index !== this.index) return; // outlines are of one plane
     for (const name of ["lumen", "parent", "sac", "neck"]) if (on[name] && this.outlines[name]) this.stroke(context, this.outlines[name], matrix, LINES[name]);
     if (on.wires && this.outlines.wires) this.paintWires(context, matrix);
   }

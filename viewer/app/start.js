@@ -1,4 +1,5 @@
 // Where a case begins: drop a scan, open a case, or try the demo.
+import { zipSync } from "../src/decode.js";
 import { button, make } from "../src/dom.js";
 import { drop as remove, get, post, put } from "./api.js";
 import { ask } from "./dialogs.js";
@@ -8,7 +9,8 @@ const KINDS = "DICOM folder or ZIP · NIfTI · NRRD · MHA · RAW · STL · VTP 
 
 export function startPage(open, complain) {
   const said = make("p", { className: "drop-said", role: "status" });
-  const bring = (files) => upload(files, said).then(open).catch(complain);
+  const first = make("input", { type: "checkbox", id: "look-first", checked: localStorage.lookFirst !== "no", onChange: () => (localStorage.lookFirst = first.checked ? "yes" : "no") });
+  const bring = (files) => upload(files, said, first.checked).then(open).catch(complain);
   const tryDemo = () => {
     said.textContent = "Making the demo's scan …";
     post("/api/demo").then(({ id }) => open(id)).catch(complain);
@@ -25,6 +27,7 @@ export function startPage(open, complain) {
       button("Choose a DICOM folder", () => folder.click()),
       button("Try the demo", tryDemo),
     ]),
+    make("label", { htmlFor: "look-first" }, [first, " Check the image first: the vessel of a scan is found when you say so"]),
     said,
     file,
     folder,
@@ -52,16 +55,20 @@ export function startPage(open, complain) {
 
 const DATE = new Intl.DateTimeFormat(undefined, { dateStyle: "medium", timeStyle: "short" });
 
-/** What a case has: steps that are up to date, or results of earlier choices. */
-function progressWords(done, kept) {
+/** What a case has: work, a failure, steps that are up to date, or results of earlier choices. */
+function progressWords(done, kept, job, failed) {
+  if (job) return "at work";
+  if (failed.length) return `failed: ${failed.map((step) => TITLES[step]).join(", ")}`;
   const old = kept.filter((step) => !done.includes(step)).length;
   if (!done.length && !old) return "no step done";
   return `${done.length} of 7 steps done${old ? `, ${old} out of date` : ""}`;
 }
 
-function recentCase({ id, name, done, kept, changed_s, has_picture }, { open, show, complain }) {
+const TITLES = { image: "Image", vessel: "Vessel", sac: "Sac and parent", device: "Treatment", deploy: "Deploy", flow: "Flow", report: "Report" };
+
+function recentCase({ id, name, done, kept, job, failed, changed_s, has_picture }, { open, show, complain }) {
   const picture = has_picture ? make("img", { src: `/api/cases/${encodeURIComponent(id)}/picture?${changed_s}`, alt: "", width: 320, height: 200 }) : make("i", { className: "no-picture" });
-  const words = make("span", {}, [`${progressWords(done, kept)} · ${DATE.format(new Date(1000 * changed_s))}`]);
+  const words = make("span", { className: failed.length && !job ? "bad" : "" }, [`${progressWords(done, kept, job, failed)} · ${DATE.format(new Date(1000 * changed_s))}`]);
   const rename = async () => {
     const given = await ask({ title: "Rename the case", words: [], field: "Name", value: name, button: "Rename" });
     if (given && given !== name) await put(`/api/cases/${encodeURIComponent(id)}/name`, { name: given.slice(0, 120) }).then(show).catch(complain);
@@ -100,17 +107,40 @@ async function dropped(transfer) {
   return files.filter(({ name }) => !name.startsWith("."));
 }
 
-async function upload(files, said) {
+/** Files in parts of at most so many bytes, which are sent as one archive each. */
+const PART_BYTES = 64 << 20;
+
+function parts(files) {
+  const found = [[]];
+  let size = 0;
+  for (const file of files) {
+    if (size + file.size > PART_BYTES && found.at(-1).length) (found.push([]), (size = 0));
+    found.at(-1).push(file);
+    size += file.size;
+  }
+  return found;
+}
+
+/** Several files as an archive without compression. */
+async function archive(files) {
+  const entries = await Promise.all(files.map(async (file, i) => [`${i}/${file.name}`, new Uint8Array(await file.arrayBuffer())]));
+  return new Blob([zipSync(Object.fromEntries(entries), { level: 0 })]);
+}
+
+async function upload(files, said, isLookedAtFirst) {
   if (!files.length) throw new Error("What you dropped contains no file.");
   said.textContent = "Reading …";
   const name = files.length > 1 ? "scan" : files[0].name.replace(/(\.[A-Za-z]+)+$/, "") || "case";
   const { id } = await post("/api/cases", { name });
   try {
-    for (const [i, file] of files.entries()) {
-      said.textContent = files.length > 1 ? `Reading file ${i + 1} of ${files.length} …` : `Reading ${file.name} …`;
-      await put(`/api/cases/${id}/input?name=${encodeURIComponent(file.name)}`, file);
+    let count = 0;
+    for (const part of parts(files)) {
+      count += part.length;
+      said.textContent = files.length > 1 ? `Reading ${count} of ${files.length} files …` : `Reading ${part[0].name} …`;
+      const [name, body] = part.length > 1 ? ["part.zip", await archive(part)] : [part[0].name, part[0]];
+      await put(`/api/cases/${id}/input?name=${encodeURIComponent(name)}`, body);
     }
-    await post(`/api/cases/${id}/input/done`);
+    await post(`/api/cases/${id}/input/done?look_first=${isLookedAtFirst}`);
   } catch (problem) {
     await remove(`/api/cases/${id}`).catch(() => {}); // no case is left of files that cannot be read
     throw problem;

@@ -1,5 +1,6 @@
 // From the packed bytes of a scene to typed arrays. The packing is written down in vstent/report/packing.py.
 import { unzlibSync } from "fflate";
+export { zipSync } from "fflate";
 
 const ARRAYS = { u8: Uint8Array, u16: Uint16Array, u32: Uint32Array };
 

@@ -1,5 +1,14 @@
 // Elements, made with few words.
 
+/** A sentence of the program as the page says it: no options, openings by name, signs of typography. */
+export const spoken = (words) =>
+  words
+    .replace(/ \((?:without )?--[^)]*\)/g, "")
+    .replace(/\b((?:in|out)let)_(?=\d)/g, "$1 ")
+    .replaceAll("+-", "±")
+    .replace(/(^|[^\w.–-])-(?=\d)/g, "$1−")
+    .replace(/(\d)%/g, "$1\u202f%");
+
 /** An element with properties (role and aria... become attributes, `style` and `data` are objects) and children. */
 export function make(tag, properties = {}, children = []) {
   const element = document.createElement(tag);
@@ -11,7 +20,7 @@ export function make(tag, properties = {}, children = []) {
     else if (name.startsWith("on")) element.addEventListener(name.slice(2).toLowerCase(), value);
     else element[name] = value;
   }
-  element.append(...children);
+  element.append(...children.map((child) => (typeof child === "string" ? spoken(child) : child)));
   return element;
 }
 

@@ -100,7 +100,8 @@ def _differences(given: dict[str, Any], usual: dict[str, Any], before: str = "")
         if isinstance(value, dict) and isinstance(usual[name], dict):
             yield from _differences(value, usual[name], f"{before}{name} ")
         elif value != usual[name]:
-            yield f"{before}{name}" + ("" if isinstance(value, dict | tuple) else f" {value}")
+            word = {True: "yes", False: "no"}.get(value, value) if isinstance(value, bool) else value
+            yield f"{before}{name}{'' if isinstance(value, dict | tuple) else f' {word}'}".replace("_", " ")
 
 
 OF_IMAGE: Final = ("units", "frame", "spacing_mm", "shape", "crop_mm", "threshold", "at_mm")

@@ -14,11 +14,12 @@ STEP_CELLS: Final = 0.6
 """Distance between the points of a cut, as a fraction of the finest grid spacing."""
 
 
-def cut(pane: str, field: FlowField, anatomy: Anatomy) -> MeshLayer:
-    """Return the speed on the plane of the profile view, through the center of the sac, or else of the axis."""
-    right, up = views_of(anatomy)[0].axes[:2]
+def cut(pane: str, field: FlowField, anatomy: Anatomy, toward_mm: float = 0.0) -> MeshLayer:
+    """Return the speed on a plane of the profile view, so far from the center of the sac, or else of the axis."""
+    right, up, toward = views_of(anatomy)[0].axes
     sacs = anatomy.aneurysms
     middle = sacs[0].sac.vertices_mm.mean(axis=0) if sacs else anatomy.parent.axis.points_mm.mean(axis=0)
+    middle = middle + toward_mm * toward
     step_mm = STEP_CELLS * field.finest.cell_size_mm
     seen = (field.centers_mm - middle) @ np.stack([right, up], axis=1)
     ticks = [np.arange(low, high + step_mm, step_mm) for low, high in zip(seen.min(0), seen.max(0), strict=True)]
@@ -32,4 +33,4 @@ def cut(pane: str, field: FlowField, anatomy: Anatomy) -> MeshLayer:
     quads = quads[is_blood(field, points_mm)[quads].all(axis=1)]
     used, corners = np.unique(np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]), return_inverse=True)
     surface = Surface(points_mm[used], corners.reshape(-1, 3))
-    return MeshLayer("slice", pane, (0.5, 0.5, 0.5), surface, scale="speed", values=speed[used])
+    return MeshLayer("slice", pane, (0.5, 0.5, 0.5), surface, scale="slice_speed", values=speed[used])

@@ -37,8 +37,10 @@ from vstent.devices.treatment import BARE, Implant, Placing, Treatment, with_dev
 from vstent.errors import DeviceError, InputError, ReadError, VstentError
 from vstent.flow.case import FlowField
 from vstent.flow.domain import default_cell_size_mm
+from vstent.flow.ends import ASSUMED
 from vstent.flow.problem import vessel_case
 from vstent.flow.settings import FlowSettings
+from vstent.flow.simulation import foretell_cost
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import PARENT, Anatomy, Opening
 from vstent.io.archive import load_data
@@ -280,11 +282,15 @@ class Preview:
         """Return the layers of a flow, with its cut: of its mean, or of one moment of its last cycle."""
 
         def draw() -> list[MeshLayer | LineLayer]:
-            flow = self._loaded(path, FlowField)
-            shown = flow if moment is None or not flow.phases else flow.at_phase(flow.phases[moment % len(flow.phases)])
+            shown = self._flow(path, moment)
             return [*flow_layers(name, shown, self.anatomy), cut(name, shown, self.anatomy)]
 
         return self._cached(("layers", path, path.stat().st_mtime_ns, self.case.state.anatomy, moment), draw)
+
+    def _flow(self, path: Path, moment: int | None) -> FlowField:
+        """Return the mean of a flow, or one moment of its last cycle."""
+        flow = self._loaded(path, FlowField)
+        return flow if moment is None or not flow.phases else flow.at_phase(flow.phases[moment % len(flow.phases)])
 
     def plan(self) -> bytes:
         """Return the plan of the chosen treatments as PDF, one page per implant.
@@ -406,10 +412,20 @@ class Preview:
                     self._ask(with_device(key))
                     if not isinstance(find_design(key), Coil):  # which have a density instead
                         sizes[key] = size_of(Implant(key, key), self.anatomy).label
-            return {"inflow_mL_s": case.inflow_mL_s, "cell_size_mm": default_cell_size_mm(case), "sizes": sizes}
+            return {
+                "inflow_mL_s": case.inflow_mL_s,
+                "inflow_source": ASSUMED,
+                "cell_size_mm": default_cell_size_mm(case),
+                "sizes": sizes,
+            }
 
         is_without = self.case.state.choices.without_aneurysm
-        return self._cached(("proposed", self.case.state.anatomy, is_without, *devices), propose)
+        found = self._cached(("proposed", self.case.state.anatomy, is_without, *devices), propose)
+        try:
+            cost = foretell_cost(vessel_case(self.anatomy.vessel, self.case.state.settings().flow or FlowSettings()))
+        except VstentError as error:
+            cost = str(error)
+        return found | {"cost": cost}
 
     def _sketch(self, wall: MeasuredWall, implant: Implant) -> Sketch:
         """Return the preview of an implant at its place, or at the proposed one, on a wall that is measured for it."""
@@ -488,8 +504,8 @@ class Preview:
                 told.append({"pane": pane, "title": title, "measures": self._sheets(treatment)})
             return message(layers, scales_of(layers, self.anatomy), compared=told)
 
-    def flow_message(self, moment: int | None) -> bytes:
-        """Return wall shear stress, streamlines and a cut of every flow, on common color scales.
+    def flow_message(self, moment: int | None, cut_mm: float | None = None) -> bytes:
+        """Return wall shear stress, streamlines and a cut of every flow, or another cut alone, on common color scales.
 
         Raises ReadError: flows are missing.
         """
@@ -499,6 +515,8 @@ class Preview:
                 raise ReadError("Some flows of these results are missing. Run the step Flow.")
             layers = [layer for name, path in paths.items() for layer in self._flow_layers(name, path, moment)]
             of_scales, phases = layers, self._loaded(next(iter(paths.values())), FlowField).phases
+            if cut_mm is not None:
+                layers = [cut(name, self._flow(path, moment), self.anatomy, cut_mm) for name, path in paths.items()]
             if moment is not None and phases:  # all moments have the scales of that of the largest inflow
                 most = max(range(len(phases)), key=lambda k: phases[k].inflow_mL_s)
                 of_scales = self._flow_layers(BARE, paths[BARE], most)

@@ -269,9 +269,9 @@ def _add_input(api: APIRouter, work: Workspace, of_case: Any) -> None:
             partial.unlink(missing_ok=True)
         return {"taken": True}
 
-    @api.post("/api/cases/{case_id}/input/done", summary="All files are uploaded: find the vessel")
-    def done(case: Case = of_case) -> dict[str, Any]:
-        work.begin(case)
+    @api.post("/api/cases/{case_id}/input/done", summary="All files are uploaded: find the vessel, or wait")
+    def done(look_first: bool = False, case: Case = of_case) -> dict[str, Any]:
+        work.begin(case, look_first=look_first)
         return work.view(case)
 
     @api.get("/api/cases/{case_id}/input/surface", summary="The surface as read (binary)")
@@ -378,8 +378,8 @@ def _add_scenes(api: APIRouter, work: Workspace, of_case: Any) -> None:
         return dict(work.preview(case).section(treatment, implant, abscissa_mm))
 
     @api.get("/api/cases/{case_id}/flow", summary="Wall shear stress, streamlines and a cut, on one scale (binary)")
-    def flow(moment: Moment = None, case: Case = of_case) -> Response:
-        return Binary(work.preview(case).flow_message(moment))
+    def flow(moment: Moment = None, cut_mm: Finite | None = None, case: Case = of_case) -> Response:
+        return Binary(work.preview(case).flow_message(moment, cut_mm))
 
     @api.get("/api/cases/{case_id}/angiogram", summary="Films of every flow along a C-arm direction (binary)")
     def angiogram(

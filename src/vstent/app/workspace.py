@@ -65,18 +65,20 @@ class Workspace:
                 changed_s = (case.folder / STATE).stat().st_mtime
             except (ReadError, OSError):
                 continue  # a folder of something else, a damaged one, or one that is being deleted
-            steps = statuses(case.state, "", lost)
+            steps, job = statuses(case.state, "", lost), self.jobs.running(case)
             found.append(
                 {
                     "id": case_id,
                     "name": case.state.name,
                     "done": [step for step in STEPS if steps[step] == "done"],
                     "kept": [step for step in STEPS if step in case.state.done and step not in lost],
+                    "job": job.kind if job else "",
+                    "failed": [step for step in STEPS if steps[step] == "failed"],
                     "changed_s": changed_s,
                     "has_picture": (case.folder / PICTURE).is_file(),
                 }
             )
-        return found
+        return sorted(found, key=lambda one: -one["changed_s"])
 
     def remove(self, case: Case) -> None:
         """Stop everything that works on a case, and delete it with its folder."""
@@ -125,10 +127,10 @@ class Workspace:
         self.begin(case)
         return case
 
-    def begin(self, case: Case) -> None:
-        """Find the vessel of a complete upload, unless dimensions and voxel spacing must be given first."""
+    def begin(self, case: Case, *, look_first: bool = False) -> None:
+        """Find the vessel of a complete upload, unless a scan is to be looked at or described first."""
         self.point(case, intake.found(case.folder))
-        if not _wants_grid(case):
+        if not _wants_grid(case) and not (look_first and not _is_surface(case)):
             self.start(case, "anatomy")
 
     def point(self, case: Case, path: str) -> None:

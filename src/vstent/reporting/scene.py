@@ -322,6 +322,7 @@ def stream_layer(name: str, flow: FlowField, seeds_mm: Floats) -> LineLayer:
 
 _SCALES = {
     "speed": ("Speed", "m/s", "viridis", 0.05),
+    "slice_speed": ("Speed, scale of the sac", "m/s", "viridis", 0.005),
     "shear": ("Wall shear stress", "Pa", "plasma", 1.0),
     "sac_shear": ("Wall shear stress of the sac", "Pa", "plasma", 0.05),
     "wall_gap": ("Gap between device and wall", "mm", "cividis", 0.1),
@@ -337,7 +338,7 @@ _OF_FLOW = ("speed", "shear", "sac_shear")
 def scales_of(layers: Sequence[MeshLayer | LineLayer], anatomy: Anatomy) -> tuple[Scale, ...]:
     """Return the color scales in use, each wide enough for all layers that use it.
 
-    The range of a flow scale is set by the values near the first sac in the first layer, without a device.
+    The range of a flow scale is set by the values near or in the first sac in the first layer, without a device.
     """
     import matplotlib
 
@@ -347,7 +348,13 @@ def scales_of(layers: Sequence[MeshLayer | LineLayer], anatomy: Anatomy) -> tupl
         if not used:
             continue
         high = max([least, *(float(np.percentile(layer.values, 98)) for layer in used)])
-        if name in _OF_FLOW and anatomy.aneurysms:
+        if name == "slice_speed" and anatomy.aneurysms:  # of the sac's inside, where devices differ
+            wall_mm = anatomy.aneurysms[0].sac.vertices_mm
+            middle = wall_mm.mean(axis=0)
+            radius_mm = 0.75 * float(np.median(np.linalg.norm(wall_mm - middle, axis=1)))
+            inside = used[0].values[np.linalg.norm(used[0].vertices_mm - middle, axis=1) < radius_mm]
+            high = 2.5 * float(np.median(inside)) if len(inside) else high
+        elif name in _OF_FLOW and anatomy.aneurysms:
             tree = cKDTree(anatomy.aneurysms[0].sac.vertices_mm)
             away_mm = tree.query(used[0].vertices_mm, distance_upper_bound=BESIDE_SAC_MM)[0]
             near = used[0].values[away_mm < BESIDE_SAC_MM]

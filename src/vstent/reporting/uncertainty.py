@@ -42,16 +42,19 @@ class Row(NamedTuple):
     """Lower end, with unit."""
     high: str
     """Upper end, with unit."""
-    band: str
-    """Both ends with the unit once, such as ``14.7 to 19.1 mm``; one where they are alike."""
     cause: str
     """Number of the device that contributes most, with its share of the variance; empty where there is none."""
+
+    @property
+    def band(self) -> str:
+        """Both ends with the unit once."""
+        return between(self.low, self.high)
 
 
 def number_name(name: str) -> str:
     """Return the display name of a number of the catalogue; further groups of wires have their number."""
     group = re.fullmatch(r"wire_(\d+)_(\w+)", name)
-    return f"{NUMBERS[f'wire_{group[2]}']} (wires of kind {group[1]})" if group else NUMBERS.get(name, name)
+    return f"{NUMBERS[f'wire_{group[2]}']} of wire kind {group[1]}" if group else NUMBERS.get(name, name)
 
 
 def band_rows(implant: Mapping[str, Any]) -> list[Row]:
@@ -60,8 +63,7 @@ def band_rows(implant: Mapping[str, Any]) -> list[Row]:
     for key, band in implant.get("bands", {}).get("results", {}).items():
         low, high = (format_value(key, band[end]) for end in ("low", "high"))
         cause = f"{number_name(band['cause'])} {100 * band['cause_fraction']:.0f}\u202f%" if "cause" in band else ""
-        value = format_value(key, implant.get(key))
-        found.append(Row(Quantity((key,), 0.0).name, value, low, high, between(low, high), cause))
+        found.append(Row(Quantity((key,), 0.0).name, format_value(key, implant.get(key)), low, high, cause))
     return found
 
 
@@ -116,10 +118,13 @@ class Interval(NamedTuple):
     """Lower end of the 95 % interval, with unit."""
     high: str
     """Upper end of the 95 % interval, with unit."""
-    band: str
-    """Both ends, with the unit once."""
     shares: list[tuple[str, float]]
     """Causes and their shares in the variance, the largest first."""
+
+    @property
+    def band(self) -> str:
+        """Both ends with the unit once."""
+        return between(self.low, self.high)
 
 
 class Varied(NamedTuple):
@@ -140,8 +145,7 @@ def intervals(treatment: Mapping[str, Any]) -> list[Interval]:
         names = [(cause.removesuffix("_fraction"), share) for cause, share in varied["shares"][key].items()]
         shares = [(CAUSES.get(cause) or number_name(cause), share) for cause, share in names]
         mean, low, high = (format_value(key, interval[end]) for end in ("mean", "low", "high"))
-        ordered = sorted(shares, key=lambda part: -part[1])
-        found.append(Interval(Quantity((key,), 0.0).name, mean, low, high, between(low, high), ordered))
+        found.append(Interval(Quantity((key,), 0.0).name, mean, low, high, sorted(shares, key=lambda part: -part[1])))
     return found
 
 
