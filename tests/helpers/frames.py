@@ -10,7 +10,7 @@ from vstent.devices.design import piece_length_mm
 def bending_stiffness(nodes, bars, ends, outward, *, stretch, across, along, twist):
     """Bending stiffness of a frame of bars (m, 2) about x: its `ends`, two sets of nodes, are turned as rigid bodies.
 
-    `across` and `along` are the bending stiffnesses of a bar out of the wall, whose normals are `outward`, and along it.
+    `across` and `along` are the bending stiffnesses of a bar out of the wall, with the normals `outward`, and along it.
     """
     rows, columns, values = [], [], []
     for (a, b), normal in zip(bars, outward, strict=True):

@@ -1,9 +1,8 @@
 """What a device straightens: the artery's axis as a beam in a soft bed, and the whole vessel that follows it."""
 
-import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from scipy.optimize import brentq
@@ -15,6 +14,7 @@ from vstent.deployment.measure import branches
 from vstent.deployment.motion import Motion, moved
 from vstent.devices.stent import Coils, Deployment, Landing, Stent
 from vstent.devices.stiffness import bending_stiffness_N_mm2
+from vstent.devices.treatment import read_straightening
 from vstent.errors import InputError, LandingError
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels import curves
@@ -61,33 +61,42 @@ class Straightening:
     """(4,) angle between the arms of the artery beside the device, pi where it is straight: before, after, and
     the lowest and the highest after."""
     radius_mm: Floats
-    """(4,) radius of the sharpest bend along the device: the same four."""
-    displacement_mm: Floats
-    """(3,) largest displacement of the axis: as likely, lowest and highest."""
+    """(2,) radius of the sharpest bend along the device, before and after."""
+    displacement_mm: float
+    """Largest displacement of the axis."""
     axis_length_change_fraction: float
     """Relative change of the length of the axis."""
 
     def __post_init__(self) -> None:
         freeze(self, "angle_rad", np.float64, (4,))
-        freeze(self, "radius_mm", np.float64, (4,))
-        freeze(self, "displacement_mm", np.float64, (3,))
+        freeze(self, "radius_mm", np.float64, (2,))
 
     def metrics(self) -> dict[str, float]:
         """Return the numbers by name; the end of each name is its unit."""
-        ends = ("before", "after", "after_low", "after_high")
-        found = {f"angle_{end}_rad": float(value) for end, value in zip(ends, self.angle_rad, strict=True)}
-        change_rad = self.angle_rad[1:] - self.angle_rad[0]
-        for end, change, way in zip(("", "_low", "_high"), change_rad, self.displacement_mm, strict=True):
-            found |= {f"straightened{end}_rad": float(change), f"max_displacement{end}_mm": float(way)}
-        found |= {f"bend_radius_{end}_mm": float(value) for end, value in zip(ends, self.radius_mm, strict=True)}
-        return found | {"axis_length_change_fraction": self.axis_length_change_fraction}
+        before_rad, after_rad, low_rad, high_rad = self.angle_rad.tolist()
+        return {
+            "arms_angle_before_rad": before_rad,
+            "arms_angle_after_rad": after_rad,
+            "straightened_rad": after_rad - before_rad,
+            "straightened_low_rad": low_rad - before_rad,
+            "straightened_high_rad": high_rad - before_rad,
+            "bend_radius_before_mm": float(self.radius_mm[0]),
+            "bend_radius_after_mm": float(self.radius_mm[1]),
+            "axis_displacement_mm": self.displacement_mm,
+            "axis_length_change_fraction": self.axis_length_change_fraction,
+        }
 
 
-def read_straightening(text: str) -> str:
-    """Return a setting; InputError where it is neither named nor an angle or a radius."""
-    if text in ("off", *SETTINGS) or re.fullmatch(r"\d+(\.\d*)?(deg|mm)", text):
-        return text
-    raise InputError(f"{text!r} is not off, {', '.join(SETTINGS)}, an angle such as 12deg or a radius such as 10.7mm")
+def described(measures: Mapping[str, Any]) -> str:
+    """Return the metrics of a straightening as sentences; a band that is wider than the effect comes first."""
+    value, low, high = (float(np.degrees(measures[f"straightened{end}_rad"])) for end in ("", "_low", "_high"))
+    first = "The band is wider than the effect. " if high - low > abs(value) else ""
+    band = f" ({low:.0f} to {high:.0f})" if high > low else ""
+    before_mm, after_mm = measures["bend_radius_before_mm"], measures["bend_radius_after_mm"]
+    return (
+        f"{first}The artery opens by {value:.1f} degrees{band}, the radius of its sharpest bend changes from "
+        f"{before_mm:.1f} to {after_mm:.1f} mm, and its axis moves by up to {measures['axis_displacement_mm']:.1f} mm."
+    )
 
 
 def straighten(anatomy: Anatomy, deployed: Sequence[Deployment], setting: str = "immediate") -> Straightening:
@@ -148,13 +157,12 @@ def straighten(anatomy: Anatomy, deployed: Sequence[Deployment], setting: str = 
         moved_mm if is_given else settled(rest, a * b, moved_mm) for a, b in zip(share[1:], given[1:], strict=True)
     ]
     angle_rad, radius_mm = np.array([measured(one, ends_mm) for one in shapes]).T
-    ways_mm = [float(curves.lengths(one - rest.rest_mm).max()) for one in shapes[1:]]
     return Straightening(
         on_path(yielded, first),
         again,
         angle_rad,
-        radius_mm,
-        np.array(ways_mm),
+        radius_mm[:2],
+        float(curves.lengths(moved_mm - rest.rest_mm).max()),
         float(curves.arc_length(moved_mm)[-1] / curves.arc_length(rest.rest_mm)[-1] - 1),
     )
 
