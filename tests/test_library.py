@@ -59,6 +59,7 @@ NAMES = (
     "run",
     "segment",
     "simulate",
+    "straighten",
     "struts",
     "trace",
     "trim",

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from vstent.angiography.angiogram import angiogram as angiogram
     from vstent.deployment.deploy import deploy as deploy
     from vstent.deployment.measure import measure as measure
+    from vstent.deployment.straightening import straighten as straighten
     from vstent.deployment.struts import struts as struts
     from vstent.devices.catalogue import catalogue as catalogue
     from vstent.devices.catalogue import find_design as find_design
@@ -55,6 +56,7 @@ _HOMES = {
     "find_design": "vstent.devices.catalogue",
     "find_size": "vstent.devices.catalogue",
     "deploy": "vstent.deployment.deploy",
+    "straighten": "vstent.deployment.straightening",
     "struts": "vstent.deployment.struts",
     "measure": "vstent.deployment.measure",
     "simulate": "vstent.flow.simulation",

@@ -37,6 +37,7 @@ STATED = {
     "diameter": ("4.5", Settings(treatments=tuple(with_device(one, diameter_mm=4.5) for one in USUAL))),
     "length": ("20", Settings(treatments=tuple(with_device(one, length_mm=20.0) for one in USUAL))),
     "center": ("-2", Settings(treatments=tuple(with_device(one, center_mm=-2.0) for one in USUAL))),
+    "straightening": ("12deg", Settings(straightening="12deg")),
     "no-flow": ("yes", Settings(flow=None)),
     "inlet-speed": ("0.3", Settings(flow=FlowSettings(inlet_speed_m_s=0.3))),
     "flow-rate": ("270 mL/min", Settings(flow=FlowSettings(inflow_mL_s=4.5))),

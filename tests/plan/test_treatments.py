@@ -83,7 +83,7 @@ def test_the_device_that_fits_worst_counts_with_its_gap_and_with_what_stands_out
     assert "stands out 2.0 mm from the sac into the artery" in first["reason"]
     assert "mean gap of 0.55 mm between wall and the device that fits worst" in first["reason"]
     assert last["reason"] == "Ruled out: stands out 3.2 mm from the sac into the artery."
-    assert treatment_rows([first])[0][-3:-1] == ("0.55 mm", "2.0 mm")
+    assert treatment_rows([first])[1][0][-3:-1] == ("0.55 mm", "2.0 mm")
 
 
 def test_a_flow_that_is_not_usable_ranks_nothing():
@@ -92,7 +92,7 @@ def test_a_flow_that_is_not_usable_ranks_nothing():
     first, last = rank_treatments({"best": best, "other": other})
     assert (first["treatment"], last["is_suitable"], "neck_inflow_change_fraction" in last) == ("other", False, False)
     assert last["reason"] == "Not ranked: the flow with it is not usable."
-    assert treatment_rows([last]) == [("1", "best", "none", *7 * ("",))]
+    assert treatment_rows([last])[1] == [("1", "best", "none", *7 * ("",))]
     rows = rank_treatments({"bare": {"flow": {}} | poor, "other": other})
     assert [row["reason"] for row in rows] == ["Not ranked: the flow without a device is not usable."]
 

@@ -161,6 +161,7 @@ ALL = Settings(
         Numerics(0.2, True, True, 20.0, 1e5, 0.02, 9000, 3, 0.03, 0.1, "openfoam", 2, True),
     ),
     Ranges(7, 2, 0.1, 0.2, 0.3, 0.4, 0.5),
+    "six_months",
 )
 """Settings of which every one differs from its default."""
 

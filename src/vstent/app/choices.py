@@ -8,7 +8,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model,
 
 from vstent.devices.catalogue import find_design
 from vstent.devices.design import Basket, Coil
-from vstent.devices.treatment import Treatment
+from vstent.devices.treatment import Treatment, read_straightening
 from vstent.fields import POSITION, Option, check_all
 from vstent.flow.measured import MeasuredProfile
 from vstent.flow.settings import FlowSettings, Numerics
@@ -133,6 +133,8 @@ class Choices(OfVessel):
     """Treatments to compare, each under a name of its own; one of a single device has the name of the device."""
     flow: FlowChoice = FlowChoice()
     """Settings of the flow."""
+    straightening: Annotated[str, AfterValidator(read_straightening)] = Settings.straightening
+    """How much the artery yields to its devices."""
     ranking_flows: Annotated[int, Field(ge=1, le=24)] | None = None
     """Number of best sizes of a ranking that get a flow; None: none."""
     uncertainty_samples: Samples | None = None
@@ -169,6 +171,7 @@ class Choices(OfVessel):
             input=changed(former.input, self),
             anatomy=changed(former.anatomy, self),
             treatments=self.treatments,
+            straightening=self.straightening,
             flow=self.flow.settings(former.flow or FlowSettings()),
             uncertainty=None if samples is None else replace(former.uncertainty or Ranges(), samples=samples),
         )
@@ -181,7 +184,8 @@ class Choices(OfVessel):
         """
         flow, varied = settings.flow, settings.uncertainty
         chosen = told(cls, settings.input, settings.anatomy)
-        chosen |= {"treatments": settings.treatments, "flow": {"is_wanted": False}}
+        chosen |= {"treatments": settings.treatments, "straightening": settings.straightening}
+        chosen |= {"flow": {"is_wanted": False}}
         if flow is not None:
             chosen["flow"] = told(FlowChoice, flow, flow.numerics) | {"is_pulsatile": flow.waveform is not None}
         return cls.model_validate(chosen | {"uncertainty_samples": None if varied is None else varied.samples})

@@ -22,7 +22,7 @@ from vstent.plan.rank import Candidate, Ranking
 from vstent.reporting.definitions import INDICES_WITH_OCCLUSION
 from vstent.reporting.quality import qualities
 from vstent.reporting.quantities import ERRORS, flatten, format_change, format_value, opening_rows
-from vstent.reporting.ranked import HEAD, treatment_rows
+from vstent.reporting.ranked import treatment_rows
 from vstent.reporting.uncertainty import ends, how_sure, intervals, number_name
 from vstent.study.progress import Progress
 
@@ -258,8 +258,9 @@ def ranking_table(ranking: Ranking, shown: int) -> Table:
 
 def treatments_table(ranked: Sequence[Mapping[str, Any]]) -> Table:
     """Return the table of ranked treatments."""
-    table = Table(*HEAD)
-    for row in treatment_rows(ranked):
+    head, rows = treatment_rows(ranked)
+    table = Table(*head)
+    for row in rows:
         table.add_row(*row)
     table.caption = "Scores of 100; with jailed branches: the change of their flow."
     return table

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 EPILOG: Final = "Lengths are in mm, coordinates are LPS. Research use only: not cleared for diagnosis or treatment."
 """Last line of every help text."""
-STUDY: Final = ("treatments", "flow", "uncertainty")
+STUDY: Final = ("treatments", "straightening", "flow", "uncertainty")
 """Sections of the settings that concern a study of a vessel."""
 VESSEL: Final = ("input", "anatomy")
 """Sections of the settings that concern the vessel."""

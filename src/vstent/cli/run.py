@@ -63,6 +63,7 @@ def study(
     from vstent.study.contrast import add_measures
     from vstent.study.pipeline import run
     from vstent.study.progress import Progress
+    from vstent.study.stages import straightening_notes
 
     out = arguments.out
 
@@ -83,7 +84,7 @@ def study(
     if ranked := case.metrics.get("ranking"):
         console.print(treatments_table(ranked))
         console.print(treatment_reasons(ranked))
-    for sentence in device_sentences(case.metrics):
+    for sentence in (*device_sentences(case.metrics), *straightening_notes(case.metrics)):
         console.print(sentence)
     if any("uncertainty" in found for found in case.metrics["treatments"].values()):
         console.print(uncertainty_table(case.metrics))

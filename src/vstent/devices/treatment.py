@@ -17,6 +17,9 @@ BARE: Final = "bare"
 NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,59}")
 """Form of the names of treatments and implants, which name folders."""
 
+STRAIGHTENINGS: Final = ("immediate", "six_months")
+"""Times after a treatment for which it is known how much devices straighten arteries."""
+
 _NUMBER: Final = r"\d+(?:\.\d*)?"
 """Form of a number without a sign."""
 ARM_TO_ARM: Final = ">"
@@ -38,6 +41,14 @@ IMPLANT: Final = re.compile(
     rf"(?:\s*@\s*([+-]?{_NUMBER}|{FORK}))?"
 )
 """Form of an implant in the text of a treatment: device, coils, diameter x length, > path, @ shift or fork."""
+
+
+def read_straightening(text: str) -> str:
+    """Return how much an artery yields; InputError where it is neither named nor a measured angle or radius."""
+    if text in ("off", *STRAIGHTENINGS) or re.fullmatch(rf"{_NUMBER}(?:deg|mm)", text):
+        return text
+    ways = ", ".join(("off", *STRAIGHTENINGS))
+    raise InputError(f"{text!r} is not {ways}, an angle such as 12deg or a radius such as 10.7mm")
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,8 @@ FLOWS: Final = {
     "neck_inflow_change_fraction": "neck_inflow_mL_s_ratio",
 }
 """Measure of a treatment, and the ratio of flows from which it follows."""
+STRAIGHTENED: Final = "straightened_sac_velocity_change_fraction"
+"""Measure of a treatment in an artery that has yielded to it; it has no grade."""
 WORST: Final = ("mean_wall_gap_mm", "protrusion_mm")
 """Measures of fit, of which that of the implant that fits worst counts."""
 MEASURES: Final = (*FLOWS, "neck_coverage_fraction", "metal_in_artery_mm2", "worst_branch_change_fraction", *WORST)
@@ -53,7 +55,7 @@ def rank_treatments(treatments: Mapping[str, Any]) -> list[dict[str, Any]]:
             told = {"treatment": name, "score": 0.0, "is_suitable": False, "reason": reason}
             rows.append(told | {"jailed_branches": {}})
             continue
-        implants = treatment["implants"].values()
+        implants, both = treatment["implants"].values(), treatment.get("straightening", {}).get("change", {})
         measures = {key: change[ratio] - 1 for key, ratio in FLOWS.items() if ratio in change}
         if (coverage := treatment.get("together", {}).get(UNION)) is not None:
             measures["neck_coverage_fraction"] = coverage
@@ -68,6 +70,8 @@ def rank_treatments(treatments: Mapping[str, Any]) -> list[dict[str, Any]]:
         }
         if jailed:
             measures["worst_branch_change_fraction"] = min(jailed.values())
+        if "mean_sac_velocity_m_s_ratio" in both:
+            measures[STRAIGHTENED] = both["mean_sac_velocity_m_s_ratio"] - 1
         grades, score, reason = graded(treatment_criteria().items, measures)
         told = {"score": score, "is_suitable": all(grades.values()), "reason": reason}
         rows.append({"treatment": name} | told | measures | {"jailed_branches": jailed})

@@ -26,7 +26,7 @@ from vstent.reporting.figures import Picture
 from vstent.reporting.packing import pack
 from vstent.reporting.quality import OF_GRADES, Quality, qualities
 from vstent.reporting.quantities import Change, Quantity, base_of, compare, flatten, opening_rows, spoken, unit_of
-from vstent.reporting.ranked import HEAD, treatment_rows
+from vstent.reporting.ranked import treatment_rows
 from vstent.reporting.scene import Scene, titled, treatment_title
 from vstent.reporting.uncertainty import Varied, band_rows, how_sure, uncertainty_of
 from vstent.units import counted
@@ -253,7 +253,7 @@ def as_html(told: Contents) -> str:
         script_hashes=Markup(" ".join(f"'sha256-{digest}'" for digest in hashes)),
         style=Markup(asset("report.css") + asset("viewer.css")),
         scripts=[Markup(script) for script in scripts],
-        ranked=(HEAD, treatment_rows(told.metrics.get("ranking", ()))),
+        ranked=treatment_rows(told.metrics.get("ranking", ())),
         of_grades=OF_GRADES,
         of_pulse=OF_PULSE,
         pictures=pictures[: len(told.pictures)],

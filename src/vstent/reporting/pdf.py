@@ -8,7 +8,7 @@ from vstent.reporting.definitions import OF_PULSE
 from vstent.reporting.page import Contents
 from vstent.reporting.paper import ACCENT, PAGE_IN, QUIET, Paper
 from vstent.reporting.quantities import Change, Quantity, format_change
-from vstent.reporting.ranked import HEAD, treatment_rows
+from vstent.reporting.ranked import treatment_rows
 from vstent.reporting.uncertainty import between, ends
 
 ANSWERS: Final = ("neck_inflow_mL_s", "mean_sac_velocity_m_s", "mean_sac_wss_Pa")
@@ -84,7 +84,8 @@ def _flow(paper: Paper, told: Contents) -> None:
     _table(paper, told, told.changes)
     if rows := told.metrics.get("ranking"):
         paper.heading("Treatments, the best first")
-        paper.table(treatment_rows(rows), (0.22, *[0.78 / (len(HEAD) - 1)] * (len(HEAD) - 1)), head=HEAD)
+        head, cells = treatment_rows(rows)
+        paper.table(cells, (0.22, *[0.78 / (len(head) - 1)] * (len(head) - 1)), head=head)
         for row in rows:
             paper.text(f"• {row['treatment']}: {row['reason']}")
 

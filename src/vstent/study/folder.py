@@ -34,6 +34,11 @@ def implant_folder(out: Path, treatment: str, implant: str) -> Path:
     return out / TREATMENTS / treatment / "implants" / implant
 
 
+def straightened_folder(out: Path, treatment: str) -> Path:
+    """Return the folder of the artery that has yielded to a treatment in a case folder."""
+    return out / TREATMENTS / treatment / "straightened"
+
+
 def flow_folder(out: Path, treatment: str) -> Path:
     """Return the folder of the flow with a treatment in a case folder."""
     return out / TREATMENTS / treatment / "flow"

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from vstent.devices.catalogue import find_design
-from vstent.devices.design import Coil
+from vstent.devices.design import Basket, Coil
 from vstent.devices.treatment import BARE, Implant, Treatment
 from vstent.flow.settings import LATTICE
 from vstent.io.files import existing
@@ -27,6 +27,12 @@ ANATOMY: Final = "anatomy"
 """Name of the anatomy in the store."""
 VESSEL: Final = "vessel"
 """Name of the vessel before it is trimmed in the store."""
+
+
+STRAIGHTENED: Final = "/straightened"
+"""End of the name of the flow with a treatment in the artery that has yielded to it."""
+ALONE: Final = "/straightened/bare"
+"""End of the name of the flow in the artery that has yielded, without its devices."""
 
 
 def key_of(entry: str, *parts: Any, without: tuple[str, ...] = ()) -> Key:
@@ -56,6 +62,17 @@ def anatomy_keys(source: str, settings: "Settings") -> dict[str, Key]:
 def stage_name(treatment: Treatment, implant: Implant) -> str:
     """Return the name of an implant in names of stages: that of its treatment, and its own beside others."""
     return treatment.name if len(treatment.implants) == 1 else f"{treatment.name} {implant.id}"
+
+
+def flow_stage(name: str) -> str:
+    """Return the name of the stage of a flow."""
+    return f"flow {name}".replace("/", " ")
+
+
+def yields(treatment: Treatment, settings: "Settings") -> bool:
+    """Return whether an artery yields to a treatment: where it has a device that is not in a sac."""
+    designs = [find_design(device) for device in treatment.devices]
+    return settings.straightening != "off" and not all(isinstance(one, Basket | Coil) for one in designs)
 
 
 def implant_keys(anatomy: Key, treatment: Treatment) -> dict[str, Key]:
@@ -92,6 +109,7 @@ def study_keys(source: str, settings: "Settings") -> dict[str, Key]:
             unused = (*(() if implants else ("vstent.deployment",)), *of_engine)
             used = anatomy, implants, settings.flow
             keys[f"flow {name}"] = key_of("vstent.study.stages:compute_flow", *used, without=unused)
+    keys |= _straightened_keys(anatomy, deployed, settings)
     if settings.uncertainty is not None:
         flow, unused = (settings.flow, ()) if settings.uncertainty.flow_samples else (None, ("vstent.flow",))
         for treatment in settings.treatments:
@@ -100,6 +118,22 @@ def study_keys(source: str, settings: "Settings") -> dict[str, Key]:
                 numbers = settings.uncertainty.numbers_of(find_design(device))
                 varied = key, settings.uncertainty, numbers, flow
                 keys[f"vary {treatment.name}"] = key_of("vstent.plan.uncertainty", *varied, without=unused)
+    return keys
+
+
+def _straightened_keys(anatomy: Key, deployed: Mapping[str, Mapping[str, Key]], settings: "Settings") -> dict[str, Key]:
+    """Return the keys of the arteries that yield to treatments, and of the flows in them."""
+    keys: dict[str, Key] = {}
+    for one in settings.treatments:
+        if not yields(one, settings):
+            continue
+        artery = key_of(
+            "vstent.deployment.straightening", anatomy, [*deployed[one.name].values()], settings.straightening
+        )
+        keys[f"straighten {one.name}"] = artery
+        for end in (ALONE, STRAIGHTENED) if settings.flow is not None and one.has_flow else ():
+            flow = key_of("vstent.study.stages:compute_flow", artery, end, settings.flow)
+            keys[flow_stage(f"{one.name}{end}")] = flow
     return keys
 
 

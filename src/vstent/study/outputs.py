@@ -29,14 +29,20 @@ IMPLANT: Final = ("contour.vtp", "wires.vtp", "struts.stl", "struts.3mf")
 """Files of one implant."""
 SACS: Final = ("sac.vtp", "sac_[0-9].vtp", "neck.vtp", "neck_[0-9].vtp")
 """Files of sacs and necks, as patterns."""
+OF_FLOWS: Final = ("", "straightened/", "straightened/bare/")
+"""Folders of the flows of a treatment."""
 OF_STUDY: Final = (
     *(METRICS, RUN, "report.html", "report.pdf", "plan.pdf", CRATE),
     *(f"treatments/*/implants/*/{name}" for name in IMPLANT),
-    *("treatments/*/flow/field.vtu", "treatments/*/flow/wall.vtp", "angiogram/*.*", "angiogram/*/frame_*.png"),
+    *(f"treatments/*/{part}flow/{name}" for part in OF_FLOWS for name in ("field.vtu", "wall.vtp")),
+    *(f"treatments/*/straightened/{name}" for name in ("*.vtp", "openings.json")),
+    *("angiogram/*.*", "angiogram/*/frame_*.png"),
 )
 """Files of devices, flows and reports, as patterns."""
 FOLDERS: Final = (
-    *("treatments/*/implants/*/", "treatments/*/implants/", "treatments/*/flow/", "treatments/*/", "treatments/"),
+    *(f"treatments/*/{part}" for part in ("implants/*/", "implants/", "straightened/bare/flow/", "straightened/bare/")),
+    *(f"treatments/*/{part}" for part in ("straightened/flow/", "straightened/", "flow/", "")),
+    "treatments/",
     *("convergence/", "angiogram/*/", "angiogram/"),
 )
 """Folders of the case folder that are removed when they are empty, as patterns, the innermost first."""

@@ -24,7 +24,17 @@ from vstent.io import writers
 from vstent.study import outputs, stages
 from vstent.study.contrast import add_measures, stored_measures
 from vstent.study.crate import NAME as CRATE
-from vstent.study.folder import CACHE, INPUT, LAYOUT, METRICS, RUN, TREATMENTS, claimed, implant_folder
+from vstent.study.folder import (
+    CACHE,
+    INPUT,
+    LAYOUT,
+    METRICS,
+    RUN,
+    TREATMENTS,
+    claimed,
+    implant_folder,
+    straightened_folder,
+)
 from vstent.study.keys import ANATOMY, VESSEL, anatomy_keys, hash_of, key_of, measures_key, stage_name, study_keys
 from vstent.study.progress import OnProgress, Progress
 from vstent.study.repeat import SECONDS, former_source, is_of_another, merged, note_begun, provenance, refuse_other
@@ -110,6 +120,8 @@ def run(
         anatomy = stages.find_anatomy(path, settings, store, keys)
         stages.check_inflow(anatomy, settings.flow)
         implants, failures = stages.deploy_all(anatomy, settings, store, keys)
+        yielded, unyielding = stages.straighten_all(anatomy, implants, settings, store, keys)
+        failures |= unyielding
         record = provenance(path, source, settings)
         has_former = replaces and is_of_another(out, record)
         named = [treatment.name for treatment in settings.treatments]
@@ -125,14 +137,18 @@ def run(
                 key = key_of("vstent.study.outputs:write_implant", keys[f"deploy {name}"])
                 write = partial(outputs.write_implant, folder, implants[treatment.name][implant.id])
                 store.write_once(f"struts {name}", key, folder, outputs.IMPLANT, write)
-        fields, unflown = stages.compute_flows(out, anatomy, implants, settings, store, keys)
+        for name, one in yielded.items():
+            outputs.write_anatomy(straightened_folder(out, name), one.anatomy)
+        flows, unflown = stages.compute_flows(out, anatomy, implants, settings, store, keys, yielded)
+        fields = {name: field for name, field in flows.items() if "/" not in name}
         failures |= unflown
         varied = stages.vary_all(anatomy, implants, settings, store, keys)
         computed = Computed(anatomy, implants, fields, store.load(VESSEL, keys[VESSEL], Vessel))
 
         def measures() -> dict[str, Any]:
             progress(Progress("measure", 0.0, computed=computed))
-            return stages.measure_study(anatomy, implants, fields, settings, varied, failures)
+            straightened = stages.measure_straightened(anatomy, yielded, flows, settings.flow)
+            return stages.measure_study(anatomy, implants, fields, settings, varied, failures, straightened)
 
         metrics = store.compute_once("measure", measures_key(settings, keys, failures), measures)
         add_measures(metrics, stored_measures(out, keys) if fields else {})
@@ -141,7 +157,8 @@ def run(
         writers.write_json(out / RUN, record, is_exact=True)
         of_flows = (f"Flow, {name}: {field.advice}" for name, field in fields.items())
         of_failures = (f"{name}: {sentence}" for name, sentence in failures.items())
-        notes = (*of_failures, *anatomy.vessel.notes, *anatomy.notes, *of_flows, *stages.neck_notes(metrics))
+        yields = stages.straightening_notes(metrics)
+        notes = (*of_failures, *yields, *anatomy.vessel.notes, *anatomy.notes, *of_flows, *stages.neck_notes(metrics))
         return CaseResult(
             **vars(computed),
             name=out.resolve().name,

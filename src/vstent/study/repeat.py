@@ -271,6 +271,7 @@ def merged(out: Path, settings: Settings) -> Settings:
         treatments=tuple(treatments if flow else (replace(one, has_flow=True) for one in treatments)),
         flow=flow,
         uncertainty=_same(out, "ranges of uncertainty", former.uncertainty, settings.uncertainty),
+        straightening=_same(out, "straightening", former.straightening, settings.straightening),
     )
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, get_args
 
 from vstent import fields
-from vstent.devices.treatment import Treatment, read_treatment, with_device
+from vstent.devices.treatment import Treatment, read_straightening, read_treatment, with_device
 from vstent.errors import InputError
 from vstent.fields import LENGTH, POSITION, Limits, Option, Speed, box, flag, point, setting, shape, spacing, whole
 from vstent.flow.measured import MeasuredProfile
@@ -125,6 +125,15 @@ class Settings:
     """Settings of the flows; None: no flow is computed."""
     uncertainty: Ranges | None = None
     """Ranges of the uncertainty study; None: no uncertainty study."""
+    straightening: str = setting(
+        "off",
+        "straightening",
+        "how much devices straighten the artery: off, immediate, six_months, or what was measured: the angle by which "
+        "it opens, such as 12deg, or the radius of its sharpest bend afterwards, such as 10.7mm",
+        read_straightening,
+        metavar="HOW",
+    )
+    """How much the artery yields to its devices."""
 
     def __post_init__(self) -> None:
         names = [treatment.name.casefold() for treatment in self.treatments]
@@ -179,6 +188,7 @@ def settings_of(given: Mapping[str, Any]) -> Settings:
         _treatments(given),
         flow,
         _section(Ranges, given) if varied else None,
+        given.get("straightening", "off"),
     )
 
 

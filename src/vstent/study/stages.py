@@ -7,6 +7,7 @@ from functools import partial
 from math import isfinite
 from pathlib import Path
 from re import fullmatch
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -22,6 +23,7 @@ from vstent.deployment.coils import deploy_coils, given_coils
 from vstent.deployment.deploy import deploy, propose_landing, propose_size
 from vstent.deployment.forks import beyond_mm
 from vstent.deployment.measure import jailed_branches, measure, measure_together
+from vstent.deployment.straightening import Straightening, described, straighten
 from vstent.devices.catalogue import find_design, find_sizes
 from vstent.devices.design import Basket, Coil, Size
 from vstent.devices.ranges import how_sure
@@ -46,7 +48,7 @@ from vstent.plan.bands import bands
 from vstent.plan.treatments import rank_treatments
 from vstent.plan.uncertainty import Uncertainty, vary
 from vstent.study.folder import flow_folder
-from vstent.study.keys import ANATOMY, VESSEL, stage_name
+from vstent.study.keys import ALONE, ANATOMY, STRAIGHTENED, VESSEL, flow_stage, stage_name, yields
 from vstent.study.outputs import write_field
 from vstent.study.settings import Point, Settings
 from vstent.study.store import Key, Store
@@ -261,6 +263,31 @@ def size_of(implant: Implant, anatomy: Anatomy) -> Size:
     return propose_size(replace(design, sizes=sizes), anatomy)
 
 
+def straighten_all(
+    anatomy: Anatomy, implants: Implants, settings: Settings, store: Store, keys: Keys
+) -> tuple[dict[str, Straightening], dict[str, str]]:
+    """Return the arteries that have yielded to treatments, stored or computed, and why others failed, by name."""
+    found: dict[str, Straightening] = {}
+    failures: dict[str, str] = {}
+    for treatment in settings.treatments:
+        if treatment.name not in implants or not yields(treatment, settings):
+            continue
+        stage = f"straighten {treatment.name}"
+        yielded = store.find(stage, keys[stage], Straightening)
+        if yielded is None:
+            try:
+                with store.stage(stage) as tell:
+                    yielded = straighten(anatomy, list(implants[treatment.name].values()), settings.straightening)
+                    tell(described(yielded.metrics()))
+            except InputError as error:  # such as a device that no longer fits
+                failures[treatment.name] = f"not straightened: {error}"
+                store.progress(stage, 1.0, failures[treatment.name])
+                continue
+            store.defer(stage, keys[stage], yielded)
+        found[treatment.name] = yielded
+    return found, failures
+
+
 def check_inflow(anatomy: Anatomy, flow: FlowSettings | None) -> None:
     """Raise InputError where no artery has the mean inflow: its unit or an inlet is wrong."""
     if flow is None:
@@ -288,14 +315,23 @@ def engine_folders(out: Path, settings: Settings) -> dict[str, Path]:
     """Return the folder of the engine's own files for every flow, by treatment; empty where no flow is computed."""
     if settings.flow is None:
         return {}
-    names = (BARE, *(treatment.name for treatment in settings.treatments))
+    ends = ("", ALONE, STRAIGHTENED) if settings.straightening != "off" else ("",)
+    names = (BARE, *(f"{treatment.name}{end}" for treatment in settings.treatments for end in ends))
     return {name: flow_folder(out, name) / settings.flow.numerics.engine for name in names}
 
 
 def compute_flows(
-    out: Path, anatomy: Anatomy, implants: Implants, settings: Settings, store: Store, keys: Keys
+    out: Path,
+    anatomy: Anatomy,
+    implants: Implants,
+    settings: Settings,
+    store: Store,
+    keys: Keys,
+    yielded: Mapping[str, Straightening] = MappingProxyType({}),
 ) -> tuple[dict[str, FlowField], dict[str, str]]:
     """Return the flow in the bare artery and with every treatment, and the reasons why others failed, by name.
+
+    In an artery that has yielded to a treatment it is computed without (`ALONE`) and with the devices (`STRAIGHTENED`).
 
     Each is stored as soon as it is finished; with a GPU while the next one is computed. FlowError is raised where the
     flow in the bare artery cannot be computed.
@@ -307,24 +343,30 @@ def compute_flows(
     folders = engine_folders(out, settings)
     writing: list[Callable[[], None]] = []
     stents = {BARE: [], **{name: [one.stent for one in deployed.values()] for name, deployed in implants.items()}}
+    names = [BARE, *(one.name for one in settings.treatments if one.has_flow and one.name in implants)]
+    runs = {name: (anatomy, stents.get(name, []), BARE) for name in names}
+    for name in [one for one in names if one in yielded]:
+        artery, alone = yielded[name].anatomy, f"{name}{ALONE}"
+        runs[alone] = artery, [], alone
+        runs[f"{name}{STRAIGHTENED}"] = artery, [one.stent for one in yielded[name].deployed], alone
     with BackgroundWork(settings.flow.numerics) as background:
-        for name in (BARE, *(one.name for one in settings.treatments if one.has_flow and one.name in implants)):
-            stage = f"flow {name}"
+        for name, (artery, inside, before) in runs.items():
+            stage = flow_stage(name)
             field = store.find(stage, keys[stage], FlowField)
             if field is None:
                 if name == BARE:
                     plan_flows(anatomy, stents, settings.flow, store)
                 try:
                     told, unfinished = partial(_tell_flow, store, stage), store.unfinished(stage, keys[stage])
-                    run = {"start": fields.get(BARE), "progress": told, "checkpoint": unfinished}
+                    run = {"start": fields.get(before), "progress": told, "checkpoint": unfinished}
                     with store.stage(stage) as tell:
-                        field = compute_flow(anatomy, stents[name], settings.flow, folder=folders[name], **run)
+                        field = compute_flow(artery, inside, settings.flow, folder=folders[name], **run)
                         tell(field.advice)
                 except FlowError as error:
                     if name == BARE:
                         raise
-                    failures[name] = f"flow not computed: {error}"
-                    store.progress(stage, 1.0, failures[name])
+                    failures[name.partition("/")[0]] = said = f"flow not computed: {error}"
+                    store.progress(stage, 1.0, said)
                     continue
                 writing.append(background.begin(store.saver(stage, keys[stage], field)))
             fields[name] = field
@@ -394,6 +436,7 @@ def measure_study(
     settings: Settings,
     varied: Mapping[str, Any],
     failures: Mapping[str, str],
+    yielded: Mapping[str, Any] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Return all metrics of a study: of vessel, implants and flows, with bands, uncertainties and failures."""
     shapes = sac_surfaces(anatomy) if fields else ()
@@ -422,13 +465,52 @@ def measure_study(
             )
             if not isinstance(deployment.stent.design, Basket | Coil):
                 measures["bands"] = bands_of(anatomy, deployment, measures, implant)
-    for name, spread in varied.items():
-        treatments[name]["uncertainty"] = spread
+    _add(treatments, "uncertainty", varied)
+    _add(treatments, "straightening", yielded)
     metrics = {"vessel": morphology(anatomy), "treatments": treatments}
     ranked = rank_treatments(treatments)
     if len(ranked) > 1:
         metrics["ranking"] = ranked
     return metrics | ({"failures": dict(failures)} if failures else {})
+
+
+def _add(treatments: dict[str, dict[str, Any]], part: str, found: Mapping[str, Any]) -> None:
+    """Add a part to the metrics of treatments, from that of each of them by name."""
+    for name, values in found.items():
+        treatments[name][part] = values
+
+
+def measure_straightened(
+    anatomy: Anatomy,
+    yielded: Mapping[str, Straightening],
+    fields: Mapping[str, FlowField],
+    settings: FlowSettings | None,
+) -> dict[str, dict[str, Any]]:
+    """Return the metrics of arteries that have yielded to treatments, and of the flows in them, by treatment."""
+    found: dict[str, dict[str, Any]] = {}
+    for name, artery in yielded.items():
+        found[name] = dict(artery.metrics())
+        implants = {str(number): one for number, one in enumerate(artery.deployed)}
+        for end, deployed in ((ALONE, {}), (STRAIGHTENED, implants)):
+            if (field := fields.get(f"{name}{end}")) is not None:
+                flow = between_coils(indices(field, *sac_surfaces(artery.anatomy)), _porosity(deployed, settings))
+                part = {"flow": flow, "change": ratios(indices(fields[BARE], *sac_surfaces(anatomy)), flow)}
+                found[name] |= {"bare": part} if end == ALONE else part
+    return found
+
+
+def straightening_notes(metrics: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return a note on every artery that has yielded to a treatment, with what it does to the velocity in the sac."""
+    notes, key = [], "mean_sac_velocity_m_s_ratio"
+    for name, treatment in metrics["treatments"].items():
+        if found := treatment.get("straightening"):
+            note = f"Straightening, {name}: {described(found)}"
+            changes = [part.get("change", {}).get(key) for part in (treatment, found.get("bare", {}), found)]
+            if all(changes):
+                alone, straight, both = (f"{one - 1:+.0%}" for one in changes)
+                note += f" Mean sac velocity: {alone} by the devices, {straight} by straightening, {both} by both."
+            notes.append(note)
+    return tuple(notes)
 
 
 def measure_treatment(anatomy: Anatomy, deployed: Mapping[str, Deployment]) -> dict[str, Any]:
