@@ -81,7 +81,7 @@ def test_the_first_page_is_the_answer_and_the_appendix_begins_within_ten_pages(t
         patch.setattr(Paper, "_put", noted)
         as_pdf(told)
     first = " ".join(text for _, text in pages[0])
-    for words in (told.name, told.origin, "Neck inflow", "Mean sac velocity", "Warnings"):
+    for words in (told.name, told.origin, "Neck inflow", "Mean sac velocity", "Fit and warnings"):
         assert words in first
     (appendix,) = (k for k, page in enumerate(pages) if any(text == "Appendix: method" for _, text in page))
     assert appendix < 10

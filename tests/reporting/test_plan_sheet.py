@@ -97,7 +97,7 @@ def test_it_states_what_was_measured(planned) -> None:
     sac = morphology(anatomy())
     for key in ("sac_max_diameter_mm", "neck_min_diameter_mm", "parent_proximal_diameter_mm"):
         assert format_value(key, sac[key]).replace("\u202f", " ") in text
-    assert re.search(r"C-arm for a view in profile (LAO|RAO) \d+ (CRA|CAU) \d+ ", text)
+    assert re.search(r"Working projection of the C-arm, proposed (LAO|RAO) \d+ (CRA|CAU) \d+ ", text)
     assert "2026-11-26" in text
     assert "9f9f9f9f9f9f9f9f…" in text
     assert text.count("8 more notes are in the report.") == 3

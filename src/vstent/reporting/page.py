@@ -187,7 +187,7 @@ def contents_of(case: "CaseResult", drawing: Drawing | None = None) -> Contents:
         implants=implants,
         openings=opening_rows(case.anatomy.vessel.openings),
         is_pulse=any(field.phases for field in case.fields.values()),
-        notes=tuple(case.notes),
+        notes=tuple(note.replace(f"Flow, {BARE}:", "Flow without a device:") for note in case.notes),
         limits=limits_of(case),
         provenance=_provenance(case.provenance),
         origin=_origin(case.provenance.get("input", {})),
@@ -281,11 +281,9 @@ def _implant(
     stent = deployment.stent
     diameters = ", ".join(f"{d:g}" for d in np.unique(stent.wire_diameter_um))
     wires = f"{len(stent.wire_diameter_um)} wires or struts of {diameters} µm"
-    steps = counted(len(deployment.terminated_fraction), "iteration")
-    how = f"The active contour reached the wall in {steps}"
+    words = f"The active contour reached the wall in {deployment.seconds:.2f} s."
     if deployment.outcome != "terminated":
-        how = f"The active contour stopped at its limit of {steps}"
-    words = f"{how} ({deployment.seconds:.2f} s)."
+        words = f"The active contour stopped at its limit of {len(deployment.terminated_fraction)} iterations."
     if isinstance(stent, Coils):
         wires = f"{counted(len(stent.coils), 'coil')} of {diameters} µm"
         words = f"Pushed in one after the other, in {deployment.seconds:.0f} s; seed {stent.seed}."

@@ -34,6 +34,7 @@ def as_pdf(told: Contents) -> bytes:
     with rc_context({"pdf.fonttype": 42, "font.family": "DejaVu Sans"}):
         paper = Paper(told.name)
         _answer(paper, told)
+        paper.turn()
         _flow(paper, told)
         paper.heading("Anatomy")
         _pictures(paper, told, "Anatomy")
@@ -64,7 +65,7 @@ def _answer(paper: Paper, told: Contents) -> None:
     _table(paper, told, [row for key in ANSWERS for row in told.changes if row.before.key == key], answers=True)
     if not told.changes:
         paper.text("No blood flow was computed for this case.")
-    paper.heading("Warnings")
+    paper.heading("Fit and warnings")
     poor = [one.sentence for one in told.qualities if one.grade != GOOD]
     for sentence in (*poor, *(one["advice"] for one in told.implants)):
         paper.text(f"• {sentence}")
@@ -85,7 +86,8 @@ def _flow(paper: Paper, told: Contents) -> None:
     if rows := told.metrics.get("ranking"):
         paper.heading("Treatments, the best first")
         head, cells = treatment_rows(rows)
-        paper.table(cells, (0.22, *[0.78 / (len(head) - 1)] * (len(head) - 1)), head=head)
+        width = 0.74 / (len(head) - 2)
+        paper.table(cells, (0.04, 0.22, *[width] * (len(head) - 2)), head=head, names=(0, 1))
         for row in rows:
             paper.text(f"• {row['treatment']}: {row['reason']}")
 
@@ -93,6 +95,7 @@ def _flow(paper: Paper, told: Contents) -> None:
 def _devices(paper: Paper, told: Contents) -> None:
     """Write pictures and numbers of all implants side by side, with bands where there are any."""
     if told.implants:
+        paper.room(0.3 * PAGE_IN[1])
         paper.heading("Devices and deployment")
     _pictures(paper, told, "Devices")
     for implant in told.implants:

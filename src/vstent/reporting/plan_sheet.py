@@ -10,6 +10,7 @@ from vstent.anatomy.landing_zones import ZONE_MM, neck_span_mm
 from vstent.anatomy.morphology import morphology
 from vstent.anatomy.restore.paths import on_path
 from vstent.angiography.view import fitted
+from vstent.angiography.working_projection import working_projection
 from vstent.devices.design import Basket, Coil
 from vstent.devices.stent import Coils, Deployment, Stent
 from vstent.geometry.vessel import Anatomy
@@ -19,7 +20,7 @@ from vstent.reporting.figures import Picture, Plate, wire_shots
 from vstent.reporting.page import HASH_DIGITS
 from vstent.reporting.paper import QUIET, Paper
 from vstent.reporting.quantities import format_value
-from vstent.reporting.scene import Implants, scene_of, titled, views_of
+from vstent.reporting.scene import Implants, scene_of, titled
 from vstent.reporting.uncertainty import ends, how_sure
 
 PICTURE_SHARE: Final = 0.19
@@ -120,7 +121,7 @@ def _picture(case: Planned, name: str) -> Picture:
 
 
 def _vessel_rows(anatomy: Anatomy) -> list[tuple[str, str]]:
-    """Return sac size, neck width, parent diameter and the direction of the C-arm that shows the neck in profile."""
+    """Return sac size, neck width, parent diameter and the working projection."""
     found, rows = morphology(anatomy), []
     for words, keys in (
         ("Sac: largest diameter, height, volume", ("sac_max_diameter_mm", "sac_height_mm", "sac_volume_mm3")),
@@ -130,10 +131,8 @@ def _vessel_rows(anatomy: Anatomy) -> list[tuple[str, str]]:
         if all(key in found for key in keys):
             rows.append((words, ", ".join(format_value(key, found[key]) for key in keys)))
     if anatomy.vessel.is_oriented:
-        profile = views_of(anatomy)[0]
-        x, y, z = profile.axes[2]
-        angles = float(np.arctan2(x, -y)), float(np.arcsin(np.clip(z, -1.0, 1.0)))
-        rows.append(("C-arm for a view in profile", fitted(profile.center_mm[None], angles).name))
+        arm = fitted(anatomy.parent.axis.points_mm[:1], working_projection(anatomy))
+        rows.append(("Working projection of the C-arm, proposed", arm.name))
     return rows
 
 
