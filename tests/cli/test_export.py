@@ -11,7 +11,7 @@ from shapes import sphere
 
 from vstent import phantoms
 from vstent.cli import main
-from vstent.devices.treatment import with_device
+from vstent.devices.treatment import read_treatment, with_device
 from vstent.geometry.surface import Surface
 from vstent.io.surfaces import read_surface
 from vstent.io.vtk_reader import read_mesh
@@ -32,7 +32,12 @@ def artery(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def studied(artery: Path) -> Path:
     out = artery.parent / "case"
     placed = with_device("enterprise", center_mm=26.0)
-    run(artery, out, Settings(InputSettings(units="mm"), treatments=(placed,), flow=None), lambda *_: None)
+    run(
+        artery,
+        out,
+        Settings(InputSettings(units="mm"), treatments=(placed, read_treatment("Y = enterprise@1")), flow=None),
+        lambda *_: None,
+    )
     return out
 
 
@@ -112,6 +117,14 @@ def test_an_openfoam_case_of_a_studied_case_has_its_device_over_the_neck(studied
     inlet = json.loads((studied / "openings.json").read_text())["openings"][0]
     flow_m3_s = -np.dot([float(x) for x in mean.strip("()").split()], inlet["normal"]) * inlet["area_mm2"] * 1e-6
     assert flow_m3_s == pytest.approx(2.5e-6, rel=0.01)
+
+
+def test_a_treatment_of_the_case_is_exported_by_its_name_alone(studied: Path, tmp_path: Path) -> None:
+    out, same = tmp_path / "foam", tmp_path / "same"
+    assert main(["export", "openfoam", str(studied), "--out", str(out), "--treatment", "Y"]) == 0
+    assert main(["export", "openfoam", str(studied), "--out", str(same), "--treatment", "enterprise@1"]) == 0
+    name = Path("constant") / "triSurface" / "struts.stl"
+    assert (out / name).read_text() == (same / name).read_text()
 
 
 @pytest.mark.parametrize("what", ["openfoam", "patches"])

@@ -179,6 +179,10 @@ def test_what_makes_no_sense_is_refused_in_a_sentence():
         deploy(BARREL, tube(line(30), 2.0))
     with pytest.raises(LandingError, match="is placed by its proximal end"):
         deploy(BARREL, ball(3.5, 2.2), landing=Landing(1.0))
+    with pytest.raises(LandingError, match=r"A shift of 50 mm puts .* outside the sac, which is 6.2 mm high"):
+        deploy(BARREL, ball(3.5, 2.2), landing=Landing(50.0, "proximal"))
+    raised = deploy(BARREL, ball(3.5, 2.2), landing=Landing(3.0, "proximal"))
+    assert "lower than asked for, because the dome is in the way" in raised.advice
     with pytest.raises(InputError, match="WEB SL lies in a sac, and the ranking is of devices for arteries"):
         rank(tube(line(30), 2.0), [BARREL])
     sac = ball(3.5, 2.2)

@@ -273,18 +273,20 @@ def test_a_region_resists_alike_in_all_directions_with_inertia(density: float, w
 
 
 def test_a_region_and_a_sheet_in_one_cell_add() -> None:
-    """The region is in half of the cells of the sheet, and alone in others, where it has no axis."""
+    """The region is in half of the cells of the sheet, and alone in others, where it has no axis.
+
+    Along the normal the quadratic term of `resist` is whole, and in a region without one it is halved.
+    """
     sheet = samples(np.array([0.0, 0.0, 1.0]), 60.0, 0.0)
     places = np.argwhere(np.ones(SHAPE, bool)) + 0.0
     alike = np.ones(len(places))
-    region = Sheet(
-        1e3 * CELL_M * places, np.zeros((len(places), 3)), 1e-3 * alike, alike, alike, 0 * alike, alike, alike
-    )
+    region = Sheet(1e3 * CELL_M * places, np.zeros((len(places), 3)), 1e-3 * alike, alike, alike, alike, alike, alike)
     alone, both = dict(zip(*entries((sheet,)), strict=True)), dict(zip(*entries((region, sheet)), strict=True))
     of_region = dict(zip(*entries((region,)), strict=True))
-    for cell, (*normal, along, across, _, spread) in both.items():
+    for cell, (*normal, along, across, loss, spread) in both.items():
         mine = alone.get(cell, np.zeros(7))
         assert along == pytest.approx(mine[3] + of_region[cell][3], rel=1e-5)
         assert across == pytest.approx(mine[4] + of_region[cell][4], rel=1e-5)
+        assert loss == pytest.approx(mine[5] + (0.5 if cell in alone else 1.0) * of_region[cell][5], rel=1e-5)
         np.testing.assert_allclose(np.abs(normal), np.abs(mine[:3]), atol=1e-6)
         assert spread <= mine[6] + 1e-9

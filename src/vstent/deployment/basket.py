@@ -215,6 +215,11 @@ def deploy_basket(basket: Basket, anatomy: Anatomy, size: Size | None, landing: 
     room, offset_mm = room_of(aneurysm, basket.n_columns), basket.wall_offset_um * MM_PER_UM
     if size.diameter_mm <= room.neck_width_mm:
         raise LandingError(_too_wide(basket, room, size.diameter_mm))
+    if not -room.height_mm < landing.abscissa_mm < room.height_mm:
+        raise LandingError(
+            f"A shift of {landing.abscissa_mm:g} mm puts {basket.name} outside the sac, which is {room.height_mm:.1f} "
+            "mm high. Give a smaller one."
+        )
     heights_mm, in_plane_mm, count = _lies(basket, room, size, landing.abscissa_mm)
     rows = grid(basket, size).rows
     wanted = np.linspace(0.0, count[-1], rows // 2 + 1 if basket.is_cup else rows)
@@ -231,7 +236,7 @@ def deploy_basket(basket: Basket, anatomy: Anatomy, size: Size | None, landing: 
     return Deployment(
         stent=stent,
         outcome="terminated",
-        advice=_advise(anatomy, stent, gap_mm),
+        advice=_advise(anatomy, stent, gap_mm, landing.abscissa_mm),
         terminated_fraction=np.ones(1),
         seconds=time.perf_counter() - began,
         wall_gap_mm=gap_mm,
@@ -408,14 +413,18 @@ def _too_wide(basket: Basket, room: Room, widest_mm: float) -> str:
     )
 
 
-def _advise(anatomy: Anatomy, stent: Stent, gap_mm: Floats) -> str:
-    """Describe how a basket lies, and what to do if it does not fit."""
+def _advise(anatomy: Anatomy, stent: Stent, gap_mm: Floats, wanted_mm: float) -> str:
+    """Describe how a basket lies, wanted at a height above the neck, and what to do if it does not fit."""
     found = _shape(anatomy, stent, gap_mm) | _over_neck(anatomy, stent)
     lies = (
         f"{stent.design.name} {stent.size.label} is {found['basket_width_mm']:.1f} mm wide and "
         f"{found['basket_height_mm']:.1f} mm high in a sac of {found['sac_width_mm']:.1f} x "
         f"{found['sac_axis_height_mm']:.1f} mm"
     )
+    if wanted_mm - stent.proximal_abscissa_mm > TOLD_MM and wanted_mm > 0:
+        lies += (
+            f", {wanted_mm - stent.proximal_abscissa_mm:.1f} mm lower than asked for, because the dome is in the way"
+        )
     if found["protrusion_mm"] > TOLD_MM:
         lower = [one for one in stent.design.sizes if one.diameter_mm == stent.size.diameter_mm]
         has_lower = any(one.length_mm < stent.size.length_mm for one in lower)

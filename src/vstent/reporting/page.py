@@ -57,7 +57,7 @@ AT_INLETS: Final = "The flow through each inlet is assumed, not measured in the 
 """Limit that a report states where the vessel has several inlets."""
 OF_DEVICE: Final = {
     LATTICE: "In the flow a device is a porous screen computed from its wires.",
-    OPENFOAM: "In the flow a device is its meshed wires over the neck and over branches.",
+    OPENFOAM: "In the flow a device is its meshed wires over the neck and over branches; coils are porous zones.",
 }
 """How a device is represented in the flow, by the name of the engine."""
 

@@ -1,6 +1,6 @@
 """Export a case or an input for other solvers: an OpenFOAM case folder, or named patches."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from vstent.devices.stent import Stent
+from vstent.devices.treatment import Treatment
 from vstent.errors import FlowError, InputError
 from vstent.fields import differing
 from vstent.flow.domain import default_cell_size_mm
@@ -88,6 +89,15 @@ def export_patches(path: Path, out: Path, settings: Settings, progress: OnProgre
     return said
 
 
+def _of_run(wanted: Treatment, treatments: Sequence[Treatment]) -> Treatment:
+    """Return the treatment of a run that is meant by its name alone or by its devices; else the wanted one."""
+    for one in treatments:
+        is_named = wanted.devices == (wanted.name,) and one.name.casefold() == wanted.name
+        if wanted.is_proposed and (is_named or (one.name, one.plan) == (wanted.name, wanted.plan)):
+            return one
+    return wanted
+
+
 def _deployed(path: Path, settings: Settings, store: Store, progress: OnProgress) -> tuple[Anatomy, list[Stent]]:
     """Return the anatomy of the run of a case folder, or of an input, and the implants of the first treatment.
 
@@ -101,8 +111,7 @@ def _deployed(path: Path, settings: Settings, store: Store, progress: OnProgress
             words = ", ".join(f"--{name}" for name in given)
             raise InputError(f"{path} is a case folder, whose vessel is exported as it is: leave out {words}")
         source, of_run = finished_run(path)
-        known = {(one.name, one.plan): one for one in of_run.treatments}
-        chosen = [known.get((one.name, one.plan), one) if one.is_proposed else one for one in study.treatments]
+        chosen = [_of_run(one, of_run.treatments) for one in study.treatments]
         study = replace(study, input=of_run.input, anatomy=of_run.anatomy, treatments=tuple(chosen))
         store, keys = Store(path / CACHE, progress), study_keys(source, study)
         anatomy = finished_anatomy(path, store, keys)

@@ -38,7 +38,7 @@ from vstent.flow.grade import computation_of, grade
 from vstent.flow.indices import balance, between_coils, indices, ratios
 from vstent.flow.ostium import sac_surfaces
 from vstent.flow.problem import flow_case, vessel_case
-from vstent.flow.settings import OPENFOAM, FlowSettings
+from vstent.flow.settings import FlowSettings
 from vstent.flow.simulation import foretell_cost, simulate_case
 from vstent.geometry.vessel import PARENT, Anatomy, Vessel
 from vstent.io.files import is_surface_file
@@ -526,7 +526,7 @@ def measure_treatment(anatomy: Anatomy, deployed: Mapping[str, Deployment]) -> d
 
 def _porosity(deployed: Mapping[str, Deployment], flow: FlowSettings | None) -> float:
     """Return blood's part of a sac in which coils are a porous region in the flow; 1 where there are none."""
-    if flow is None or flow.numerics.resolve_wires or flow.numerics.engine == OPENFOAM:
+    if flow is None or flow.numerics.resolve_wires:
         return 1.0
     return 1.0 - sum(one.stent.density_fraction for one in deployed.values() if isinstance(one.stent, Coils))
 

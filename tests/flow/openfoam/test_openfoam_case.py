@@ -16,13 +16,15 @@ from vstent.deployment.deploy import deploy
 from vstent.deployment.struts import struts
 from vstent.devices.catalogue import find_design
 from vstent.errors import FlowError, InputError, LandingError
-from vstent.flow.case import FlowCase, Target
+from vstent.flow.case import FlowCase, Sheet, Target
+from vstent.flow.drag import COIL_INERTIA
 from vstent.flow.openfoam.case import foam_case, strut_solids
 from vstent.flow.openfoam.control import fluid
 from vstent.flow.openfoam.cost import tell_cost
 from vstent.flow.openfoam.dictionary import foam_file
 from vstent.flow.openfoam.engine import OpenFoam
 from vstent.flow.openfoam.patches import named_patches
+from vstent.flow.openfoam.porous import BANDS, porous_files
 from vstent.flow.openfoam.setup import FoamSetup
 from vstent.flow.problem import flow_case, vessel_case
 from vstent.flow.settings import Blood, CarreauYasuda, FlowSettings, Numerics
@@ -300,6 +302,40 @@ def test_a_pulse_repeats_and_keeps_its_mean() -> None:
     assert float(steady[1]) == pytest.approx(FLOW_ML_S * 1e-6 * cubes[1] / cubes.sum())
     control = parse(foam_case(case("murray", is_pulse=True), SETUP).files["system/controlDict"])
     assert float(control["endTime"][0]) == pytest.approx(4 * OLDER_ADULT_ICA.period_s)
+
+
+def test_a_region_of_coils_becomes_nested_zones_with_its_resistance() -> None:
+    """Every sample lies in the zone of its resistance, and d and f are the means there."""
+    steps = np.argwhere(np.linalg.norm(np.indices((21, 21, 21)) - 10, axis=0) < 9.0)
+    points_mm, alike = 0.15 * steps + [5.0, 0.0, 0.0], np.ones(len(steps))
+    depth = np.linalg.norm(steps - 10, axis=1)
+    permeability_mm2 = 0.004 * (1 + depth)  # denser inside
+    viscous = Blood().viscosity_Pa_s / (permeability_mm2 * 1e-3)
+    loss = 4 * COIL_INERTIA * 0.3 / permeability_mm2
+    region = Sheet(points_mm, np.zeros((len(steps), 3)), 0.15**3 * alike, viscous, viscous, loss, alike, alike)
+    coiled = replace(case(), media=(region,))
+    assert strut_solids(coiled) is None
+    for flavour, name in (("com", "fvOptions"), ("org", "fvModels")):
+        setup = FoamSetup(0.2, flavour)
+        files, surfaces = porous_files(coiled, setup)
+        assert set(files) == {"system/topoSetDict", f"constant/{name}"}
+        assert "topoSet" in foam_case(coiled, setup).files["Allrun"]
+    zones = []
+    for name, solids in surfaces.items():
+        vertices_mm, at = np.unique(solids[name].reshape(-1, 3).round(6), axis=0, return_inverse=True)
+        zones.append(Surface(vertices_mm, at.reshape(-1, 3)))
+    assert not any(zone.boundary_loops for zone in zones)
+    inside = np.array([zone.signed_distance(points_mm) < 0 for zone in zones])
+    number = inside.sum(axis=0) - 1
+    assert (np.diff(inside.astype(int), axis=0) <= 0).all()
+    assert number.min() == 0
+    models = parse(files["constant/fvModels"])
+    for band in range(BANDS):
+        told = models[f"coils_{band + 1}"]["porosityForceCoeffs"]
+        darcy = (1e6 / permeability_mm2[number == band]).mean()
+        assert float(told["d"][1]) == pytest.approx(darcy, rel=0.03)
+        assert float(told["f"][1]) == pytest.approx(2 * COIL_INERTIA * 0.3e-3 * darcy, rel=0.03)
+    assert "topoSet" not in foam_case(case(), FoamSetup(0.2)).files["Allrun"]
 
 
 def test_a_device_is_meshed_by_its_wires_over_an_ostium_or_refused() -> None:

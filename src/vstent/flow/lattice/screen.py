@@ -15,7 +15,7 @@ behind one: within 15 % for 60 Pa s/m each, and 40 % too low (both at the same p
 apart) for 380. From two cells apart on each acts as alone (`tests/flow/test_screen_sheet.py`).
 
 A region, in which coils resist alike in all directions, has the normal 0. Where it shares a cell with a sheet, its
-inertial loss along the sheet's normal counts twice.
+inertial loss is right along the sheet's normal and half as large across it, because a cell stores one coefficient.
 
 Two like meshes (wires of 0.03 mm, 0.25 mm apart) resist 1.9 to 2.1 times as much as one where 0.1 mm lies between them,
 and 1.5 (wires in line) to 2.9 times (staggered) where they touch, which is 2.0 for blood that has either way, at pore
@@ -162,4 +162,6 @@ def _combined(alone: Sequence[GridResistance]) -> GridResistance:
     across_axis = 0.5 * (total(along + 2 * across) - along_axis)
     # Of the velocity across the axis, a sheet at an angle to it takes part only with what lies in the sheet.
     spread = total(across * (0.5 + 0.5 * squared) * spread) / np.maximum(total(across), 1e-300)
+    is_shared_region = ~normal.any(axis=1) & axis[row].any(axis=1)
+    loss = np.where(is_shared_region, 0.5 * loss, loss)  # `collision.resist` halves that of a region alone itself
     return GridResistance(cell, axis, along_axis, across_axis, spread, total(loss))

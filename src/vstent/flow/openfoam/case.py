@@ -1,17 +1,19 @@
 """Build an OpenFOAM case folder in memory: the text of every file by its relative path."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from string import Template
 from typing import Final
 
 import numpy as np
 
+from vstent.devices.stent import Coils
 from vstent.errors import FlowError, LandingError
 from vstent.flow.case import FlowCase
 from vstent.flow.openfoam import control, mesh
 from vstent.flow.openfoam.boundary import boundary_files
 from vstent.flow.openfoam.patches import named_patches, stl_text
+from vstent.flow.openfoam.porous import porous_files, regions
 from vstent.flow.openfoam.setup import FoamSetup
 from vstent.geometry.surface import Surface
 from vstent.units import M_PER_MM
@@ -40,8 +42,12 @@ class FoamCase:
 
 
 def strut_solids(case: FlowCase) -> Surface | None:
-    """Return the solids of a case's wires, or None without a device; one without wires over an ostium is refused."""
-    if not case.solids and not case.media:
+    """Return the solids of a case's wires, or None where it has none but coils, which are porous zones.
+
+    A device without wires over an ostium is refused.
+    """
+    case = replace(case, solids=tuple(one for one in case.solids if not isinstance(one, Coils)))
+    if not case.solids and len(regions(case)) == len(case.media):
         return None
     if not case.solids:
         raise FlowError(
@@ -59,7 +65,7 @@ def strut_solids(case: FlowCase) -> Surface | None:
 def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
     """Build a case that OpenFOAM meshes and computes: steady, or transient if the case has a waveform.
 
-    Media are ignored, because OpenFOAM meshes the struts of the setup instead.
+    Of the media only regions resist, in porous zones, because OpenFOAM meshes the struts of the setup.
     """
     patches, sections = named_patches(case)
     vertices_mm, dialect, is_steady = patches[0].surface.vertices_mm, setup.dialect, case.waveform is None
@@ -75,6 +81,8 @@ def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
     if setup.struts is not None:
         surfaces[mesh.STRUTS] = {mesh.STRUTS: setup.struts.corners_mm}
         walls.append(mesh.STRUTS)
+    porous, around = porous_files(case, setup)
+    surfaces |= around
     application = dialect.application(is_steady=is_steady)["application"]
     before, solve, after = "", application, ""
     if setup.processes > 1:
@@ -95,6 +103,7 @@ def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
         "density": f"{case.blood.density_kg_m3:.6g}",
         "inflow": f"{case.inflow_mL_s:.6g}",
         "resisting": Template(RESISTING_NOTE).substitute(resistances=resistances) if case.resistances else "",
+        "zones": "    topoSet > log.topoSet 2>&1\n" if porous else "",
     }
     texts = {
         name: (resources.files(__package__) / "exported" / name).read_text(encoding="utf-8")
@@ -108,6 +117,7 @@ def foam_case(case: FlowCase, setup: FoamSetup) -> FoamCase:
         "system/blockMeshDict": mesh.block_mesh(vertices_mm, setup.cell_size_mm),
         f"system/{dialect.features}Dict": dialect.rims(f"{mesh.ENDS}.stl"),
         "system/snappyHexMeshDict": mesh.snappy(case, setup, kinds, sections),
+        **porous,
         **{name: Template(text).safe_substitute(values) for name, text in texts.items()},
         "vstent.foam": "",
         **boundary_files(case, setup, sections, walls),

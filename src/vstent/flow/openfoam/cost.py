@@ -5,6 +5,7 @@ from typing import Final
 import numpy as np
 
 from vstent.deployment.struts import thickness_mm
+from vstent.devices.stent import Coils
 from vstent.errors import FlowError
 from vstent.flow.case import FlowCase
 from vstent.flow.domain import extended_volume_mm3
@@ -73,5 +74,5 @@ def _cells(case: FlowCase, cell_size_mm: float) -> tuple[float, float]:
     setup = FoamSetup(cell_size_mm, struts=struts)
     small_mm = cell_size_mm / 2**setup.levels_at_struts
     base, more = CELLS_ALONG_WIRE
-    length_mm = sum(one.wire_length_mm for one in case.solids)
+    length_mm = sum(one.wire_length_mm for one in case.solids if not isinstance(one, Coils))
     return bare, length_mm / small_mm * (base + more * thickness_mm(struts) / small_mm)

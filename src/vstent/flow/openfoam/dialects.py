@@ -25,6 +25,12 @@ class Dialect:
     """Folder of the surfaces."""
     inside_point: str
     """Entry with the point inside the vessel."""
+    taken_off: str
+    """Action of topoSet that takes cells off a set."""
+    models: str
+    """File in constant/ of sources, such as porous zones."""
+    porosity: str
+    """Type of a porous zone in it."""
 
     @property
     def reads_geometry(self) -> bool:
@@ -85,7 +91,17 @@ class Dialect:
 
 
 DIALECTS: Final[dict[Flavour, Dialect]] = {
-    "org": Dialect(True, "foamRun", "surfaceFeatures", "foamPostProcess", "constant/geometry", "insidePoint"),
+    "org": Dialect(
+        True,
+        "foamRun",
+        "surfaceFeatures",
+        "foamPostProcess",
+        "constant/geometry",
+        "insidePoint",
+        "delete",
+        "fvModels",
+        "porosityForce",
+    ),
     "com": Dialect(
         False,
         "surfaceFeatureExtract",
@@ -93,5 +109,8 @@ DIALECTS: Final[dict[Flavour, Dialect]] = {
         "postProcess",
         "constant/triSurface",
         "locationInMesh",
+        "subtract",
+        "fvOptions",
+        "explicitPorositySource",
     ),
 }

@@ -61,6 +61,8 @@ def mesh(found: program.Program, folder: Path, setup: FoamSetup) -> None:
         ["snappyHexMesh", "-overwrite"],
         ["renumberMesh", "-overwrite"],
     ]
+    if (folder / "system" / "topoSetDict").exists():
+        commands.append(["topoSet"])
     if setup.processes > 1:
         commands.append(["decomposePar", "-force"])
     for words in commands:
