@@ -352,7 +352,7 @@ function parentOutlet(page) {
     const opening = openings.find((one) => one.role === role);
     page.choose({ outlet_mm: opening ? placeOf(opening) : null });
   };
-  const proposed = found && !given ? `${found.replace("_", " ")}, proposed` : "proposed";
+  const proposed = found && !given ? `${found.replace("_", " ")} (proposed)` : "proposed";
   return select("outlet", "Parent leads to", (given && nearest(ends, given)?.role) || "", [["", proposed], ...outlets], chosen);
 }
 

@@ -57,11 +57,10 @@ const DATE = new Intl.DateTimeFormat(undefined, { dateStyle: "medium", timeStyle
 
 /** What a case has: work, a failure, steps that are up to date, or results of earlier choices. */
 function progressWords(done, kept, job, failed) {
-  if (job) return "at work";
-  if (failed.length) return `failed: ${failed.map((step) => TITLES[step]).join(", ")}`;
+  const before = job ? "at work · " : failed.length ? `failed: ${failed.map((step) => TITLES[step]).join(", ")} · ` : "";
   const old = kept.filter((step) => !done.includes(step)).length;
-  if (!done.length && !old) return "no step done";
-  return `${done.length} of 7 steps done${old ? `, ${old} out of date` : ""}`;
+  if (!done.length && !old) return `${before}no step done`;
+  return `${before}${done.length} of 7 steps done${old ? `, ${old} out of date` : ""}`;
 }
 
 const TITLES = { image: "Image", vessel: "Vessel", sac: "Sac and parent", device: "Treatment", deploy: "Deploy", flow: "Flow", report: "Report" };

@@ -96,12 +96,14 @@ class State(BaseModel):
 
 def _differences(given: dict[str, Any], usual: dict[str, Any], before: str = "") -> Iterator[str]:
     """Yield names of settings that differ from the usual ones, with their values where those are short."""
+    from vstent.reporting.quantities import format_value, split_unit  # late, as everything that a page can wait for
+
     for name, value in given.items():
         if isinstance(value, dict) and isinstance(usual[name], dict):
             yield from _differences(value, usual[name], f"{before}{name} ")
         elif value != usual[name]:
-            word = {True: "yes", False: "no"}.get(value, value) if isinstance(value, bool) else value
-            yield f"{before}{name}{'' if isinstance(value, dict | tuple) else f' {word}'}".replace("_", " ")
+            said = "" if isinstance(value, dict | tuple) else f" {format_value(name, value)}"
+            yield f"{before}{split_unit(name)[0].replace('_', ' ')}{said}"
 
 
 OF_IMAGE: Final = ("units", "frame", "spacing_mm", "shape", "crop_mm", "threshold", "at_mm")
