@@ -120,6 +120,8 @@ function point(page, key, label) {
 const leastOf = ({ fields }, key) => fields[key]?.minimum ?? fields[key]?.exclusiveMinimum;
 
 /** How an outlet condition is called where its name in the settings does not say it. */
+/** What is known of how much devices straighten arteries; others are stated on the command line. */
+const STRAIGHTENINGS = [["off", "rigid"], ["immediate", "straightened at implantation"], ["six_months", "straightened after six months"]];
 const OUTLETS = { murray: "split by r³ (Murray)" };
 
 export const panels = {
@@ -208,6 +210,7 @@ export const panels = {
       ...inflowWords(page),
       number("cell", "Grid spacing", "mm", flow.cell_size_mm, (value) => page.chooseFlow({ cell_size_mm: value }), { min: leastOf(page, "cell_size_mm"), step: 0.01, placeholder: proposal(page.proposed?.cell_size_mm, 3) }),
       select("pulse", "Inlet", flow.is_pulsatile ? "1" : "", [["", "steady, at the mean"], ["1", "pulse of the carotid"]], (value) => page.chooseFlow({ is_pulsatile: Boolean(value) })),
+      select("straightening", "Artery", page.view.choices.straightening, STRAIGHTENINGS, (value) => page.choose({ straightening: value })),
       select("outlets", "Outlets", flow.outlets, (page.fields.outlets?.enum ?? [flow.outlets]).map((word) => [word, OUTLETS[word] ?? word.replaceAll("_", " ")]), (value) => page.chooseFlow({ outlets: value })),
     );
     parts.push(page.pulseChart(), ...unseen(page), ...state(page));

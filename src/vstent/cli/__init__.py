@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from io import TextIOWrapper
 from typing import Final
 
-from vstent.cli import angiogram, app, batch, demo, devices, export, flow, rank, run, vessel
+from vstent.cli import angiogram, app, batch, demo, devices, export, flow, followup, rank, run, vessel
 from vstent.cli.interrupt import borne_interrupts
 from vstent.cli.options import EPILOG
 from vstent.errors import InputError, VstentError
 
-COMMANDS: Final = (run, app, vessel, rank, batch, flow, angiogram, export, demo, devices)
+COMMANDS: Final = (run, app, vessel, rank, batch, flow, angiogram, followup, export, demo, devices)
 """Modules of the commands in the order of the help."""
 BAD_INPUT: Final = 2
 """Exit code where an input or option cannot be used."""

@@ -24,6 +24,7 @@ from vstent.reporting.quality import qualities
 from vstent.reporting.quantities import ERRORS, flatten, format_change, format_value, opening_rows
 from vstent.reporting.ranked import treatment_rows
 from vstent.reporting.uncertainty import ends, how_sure, intervals, number_name
+from vstent.study.followup import Followup
 from vstent.study.progress import Progress
 
 ROWS: Final = (
@@ -339,6 +340,14 @@ def angiogram_table(metrics: Mapping[str, Any]) -> Table:
     table = Table("angiogram", BARE, *_treatments(metrics))
     _add_flow_rows(table, metrics, {key: _title(key) for key in CONTRAST_ROWS})
     table.caption = "\n".join([str(table.caption or ""), *INDICES_WITH_OCCLUSION]).strip()
+    return table
+
+
+def followup_table(found: Followup) -> Table:
+    """Return the table of what was planned and what is there after the treatment."""
+    table = Table("", "planned", "after treatment")
+    for key, planned in found.planned.items():
+        table.add_row(_title(key), _cell(key, planned), _cell(key, found.real[key]))
     return table
 
 

@@ -15,6 +15,7 @@ from vstent.reporting.plan_sheet import Planned, plan_pdf
 from vstent.study.folder import CACHE
 from vstent.study.keys import key_of
 from vstent.study.repeat import SECONDS
+from vstent.study.stages import straightening_notes
 from vstent.study.store import Store
 
 if TYPE_CHECKING:
@@ -27,7 +28,8 @@ ASSETS: Final = Path(__file__).with_name("assets")
 def write_plan(case: "CaseResult", out: Path, day: str) -> None:
     """Write ``plan.pdf`` of a finished case, dated in ISO 8601, into its folder: one page per implant, no flow."""
     metrics = {name: case.metrics["treatments"][name]["implants"] for name in case.implants}
-    planned = Planned(case.name, case.anatomy, case.implants, metrics, case.provenance["input"]["sha256"], day)
+    anatomy = replace(case.anatomy, notes=(*straightening_notes(case.metrics), *case.anatomy.notes))
+    planned = Planned(case.name, anatomy, case.implants, metrics, case.provenance["input"]["sha256"], day)
     with atomic(out / "plan.pdf") as partial:
         partial.write_bytes(plan_pdf(planned))
 

@@ -1,0 +1,130 @@
+"""Compare a case with a scan or surface of the same artery after the treatment: what was planned, what is there."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vstent.anatomy.read import read_vessel
+from vstent.anatomy.restore.restore import restore
+from vstent.anatomy.trace import trace
+from vstent.anatomy.trim import trim
+from vstent.deployment.straightening import measured
+from vstent.devices.stent import Stent
+from vstent.geometry.image import Image
+from vstent.geometry.registration import Pose, registered, settled
+from vstent.geometry.vessel import Anatomy, Vessel
+from vstent.io.images import read_image
+from vstent.kernels import curves
+from vstent.kernels.arrays import Floats
+
+OFF_WALL_MM = 0.25
+"""Distance outside the landing surface, in mm, from which the lumen is not wall of the artery."""
+BESIDE_MM = 2.0
+"""Distance from the ends of the device beyond which the artery is registered, in mm."""
+STEP_MM = 0.5
+"""Distance between points at which the curvature is measured, in mm."""
+WITHIN = 1.5
+"""Largest distance of metal from the axis, in radii of the artery."""
+
+
+class Followup(NamedTuple):
+    """An artery after a treatment beside the one that was planned on."""
+
+    pose: Pose
+    """Motion from the frame of the plan into that of the follow-up."""
+    anatomy: Anatomy
+    """The artery after the treatment, in its own frame."""
+    planned: dict[str, float]
+    """Numbers of the plan; the end of each name is its unit."""
+    real: dict[str, float]
+    """The same numbers after the treatment, as far as they can be seen."""
+
+    def metrics(self) -> dict[str, Any]:
+        """Return all numbers for a file."""
+        move = {"residual_mm": self.pose.residual_mm, "turn": self.pose.turn.tolist()}
+        return {
+            "registration": move | {"shift_mm": self.pose.shift_mm.tolist()},
+            "planned": self.planned,
+            "real": self.real,
+        }
+
+
+def compare_followup(anatomy: Anatomy, stent: Stent, path: Path, metal: float | None = None) -> Followup:
+    """Compare a planned device with a scan or surface after the treatment.
+
+    Parameters
+    ----------
+    anatomy : the artery of the plan, the path of the device first.
+    stent : the device as planned.
+    path : scan or surface after the treatment.
+    metal : intensity from which voxels of a scan are metal; None: the device is not measured.
+    """
+    vessel = read_vessel(path)
+    first_pose = registered(anatomy.vessel.lumen.vertices_mm, vessel.lumen)
+    pose = settled(_outside_mm(anatomy, stent), vessel.lumen, first_pose)
+    after = _artery(anatomy, vessel, pose)
+    axis, other = anatomy.parent.axis, after.parent.axis
+    ends_mm = stent.proximal_abscissa_mm, stent.distal_abscissa_mm
+    # The axis keeps its length, so that arc lengths lead from the middle of the neck to the ends of the device.
+    middle_mm, at_mm = _middle_mm(anatomy), _middle_mm(after)
+    if not after.aneurysms:
+        at_mm = float(other.nearest_abscissa_mm(pose.of(axis.at(np.array([middle_mm]))))[0])
+    after_mm = ends_mm[0] - middle_mm + at_mm, ends_mm[1] - middle_mm + at_mm
+    planned: dict[str, float] = {}
+    real: dict[str, float] = {}
+    for found, line, ends in ((planned, axis, ends_mm), (real, other, after_mm)):
+        found["arms_angle_rad"], found["bend_radius_mm"] = measured(curves.resample(line.points_mm, STEP_MM), ends)
+    if metal is not None:
+        radius_mm = 0.5 * stent.row_diameter_mm
+        gap_mm = np.interp(stent.row_abscissa_mm, axis.abscissa_mm, anatomy.parent.section_radius_mm) - radius_mm
+        planned |= _device(np.array(ends_mm) - middle_mm, radius_mm, gap_mm)
+        along_mm, off_mm, gap_mm = _metal(read_image(path), metal, after)
+        real |= _device(np.quantile(along_mm, [0.002, 0.998]) - at_mm, off_mm, gap_mm)
+    return Followup(pose, after, planned, real)
+
+
+def _outside_mm(anatomy: Anatomy, stent: Stent) -> Floats:
+    """Return the vertices (n, 3) of the artery's wall beside the device."""
+    points_mm, wall = anatomy.vessel.lumen.vertices_mm, anatomy.parent.landing_surface
+    points_mm = points_mm[wall.closest(points_mm)[1] < OFF_WALL_MM]
+    at_mm = anatomy.parent.axis.nearest_abscissa_mm(points_mm)
+    first_mm, last_mm = stent.proximal_abscissa_mm - BESIDE_MM, stent.distal_abscissa_mm + BESIDE_MM
+    return points_mm[(at_mm < first_mm) | (at_mm > last_mm)]
+
+
+def _middle_mm(anatomy: Anatomy) -> float:
+    """Return the abscissa of the middle of the neck, or of the artery without one, in mm."""
+    if not anatomy.aneurysms:
+        return 0.5 * anatomy.parent.axis.length_mm
+    return float(np.mean(anatomy.parent.span_mm(anatomy.aneurysms[0])))
+
+
+def _artery(anatomy: Anatomy, vessel: Vessel, pose: Pose) -> Anatomy:
+    """Return the restored artery after the treatment, between the ends of the one before."""
+    axis = anatomy.parent.axis
+    first_mm, middle_mm, last_mm = pose.of(axis.at(np.array([0.0, _middle_mm(anatomy), axis.length_mm])))
+    reach_mm = {"upstream_mm": axis.length_mm, "downstream_mm": axis.length_mm}
+    traced = trim(trace(vessel, inlet_mm=first_mm), at_mm=middle_mm, **reach_mm)
+    return restore(traced, outlet_mm=last_mm)
+
+
+def _metal(image: Image, metal: float, after: Anatomy) -> tuple[Floats, Floats, Floats]:
+    """Return arc lengths, distances from the axis and gaps to the wall (n,) of the metal in an artery, in mm."""
+    points_mm = image.to_mm(np.argwhere(image.voxels >= metal).astype(np.float64))
+    path = after.parent
+    along_mm, off_mm = curves.project(path.axis.points_mm, points_mm)
+    radius_mm = np.interp(along_mm, path.axis.abscissa_mm, path.section_radius_mm)
+    is_in = (off_mm < WITHIN * radius_mm) & (along_mm > 0) & (along_mm < path.axis.length_mm)
+    return along_mm[is_in], off_mm[is_in], (radius_mm - off_mm)[is_in]
+
+
+def _device(ends_mm: Floats, radius_mm: Floats, gap_mm: Floats) -> dict[str, float]:
+    """Return the numbers of a device from its ends (2,) about the middle of the neck, its radii and its gaps."""
+    return {
+        "proximal_end_to_neck_middle_mm": float(ends_mm[0]),
+        "distal_end_to_neck_middle_mm": float(ends_mm[1]),
+        "deployed_length_mm": float(ends_mm[1] - ends_mm[0]),
+        "mean_diameter_mm": float(2 * radius_mm.mean()),
+        "max_wall_gap_mm": float(max(np.quantile(gap_mm, 0.99), 0.0)),
+    }
