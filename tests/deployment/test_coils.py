@@ -17,6 +17,9 @@ from vstent.devices.treatment import read_treatment
 from vstent.errors import InputError, LandingError
 from vstent.geometry.surface import Surface
 from vstent.kernels import rods
+from vstent.plan.ranges import Ranges
+from vstent.plan.uncertainty import COIL_RESULTS, vary_seeds
+from vstent.reporting.uncertainty import uncertainty_of
 from vstent.study.keys import study_keys
 from vstent.study.settings import Settings
 from vstent.study.stages import deploy_all, deploy_implant
@@ -93,6 +96,21 @@ def test_seeds_repeat_a_result_to_the_last_bit_and_others_give_another():
     assert len(other.wire_points_mm) != len(again.wire_points_mm) or (
         np.abs(other.wire_points_mm - again.wire_points_mm).max() > 0.1
     )
+
+
+def test_the_spread_over_seeds_is_that_of_the_same_coils_placed_otherwise():
+    coils = deploy_coils(COILS, SAC, 0.08, seed=2).stent
+    varied = vary_seeds(SAC, coils, Ranges(samples=3))
+    assert (varied.names, varied.n_failed) == (COIL_RESULTS, 0)
+    first = measure_coils(SAC, coils)
+    np.testing.assert_allclose(varied.values[0], [first[name] for name in COIL_RESULTS], rtol=0.02)
+    again = measure_coils(SAC, deploy_coils(COILS, SAC, coils.coils, seed=4).stent)
+    assert varied.values[2].tolist() == [again[name] for name in COIL_RESULTS]
+    assert np.ptp(varied.values[:, 1:], axis=0).min() > 0
+    told = varied.metrics()
+    assert told["shares"]["neck_density_fraction"] == {"rest_fraction": 1.0}
+    (row,) = uncertainty_of({"treatments": {"coils": {"uncertainty": told}}}, {})
+    assert row.words == "3 deployments. Varied: the seed, which places the catheter and turns the framing coil."
 
 
 def test_zones_share_out_all_coil():

@@ -14,8 +14,11 @@ from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
 from vstent.deployment.coverage import together
-from vstent.deployment.forks import CATHETER_MM, passage
+from vstent.deployment.deploy import deploy
+from vstent.deployment.forks import CATHETER_MM, passage, pushed_mm
 from vstent.deployment.measure import measure
+from vstent.devices.catalogue import find_design
+from vstent.devices.design import piece_length_mm
 from vstent.devices.treatment import read_treatment
 from vstent.errors import InputError, LandingError
 from vstent.study.stages import deploy_implant
@@ -173,6 +176,17 @@ def test_no_wire_passes_through_another_at_the_forks_of_patients(shared_data, ca
         found[implant.id] = deploy_implant(implant, anatomy, [found[name].stent for name in implant.inside])
         assert measure(anatomy, found[implant.id])["max_outside_mm"] <= 0.002
     assert least_gap_mm(*(one.stent for one in found.values())) >= 0
+
+
+def test_a_pushed_cell_is_as_wide_as_the_widest_polygon_with_its_struts_allows():
+    """A rhombus with sides l is l sin(angle) wide between its sides; a regular octagon (1 + sqrt 2) l."""
+    closed, opened = (deploy(find_design(name), arm("outlet_1")).stent for name in ("enterprise", "neuroform_atlas"))
+    turn = np.linspace(0.01, np.pi, 1000)
+    for stent, widest in ((closed, np.sin(turn).max()), (opened, 1 + np.sqrt(2))):
+        strut_mm = 2 * stent.pieces_mm[2].max()
+        assert pushed_mm(stent) == pytest.approx(
+            widest * piece_length_mm(stent.design, stent.size) - strut_mm, rel=1e-4
+        )
 
 
 @pytest.mark.validation

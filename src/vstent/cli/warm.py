@@ -5,6 +5,7 @@ import sys
 
 from vstent.angiography.transport import warm as warm_contrast
 from vstent.children import environment
+from vstent.deployment.coils import warm as warm_coils
 from vstent.flow.lattice.kernels.warm import flow
 from vstent.kernels.warm import project, sample
 from vstent.kernels.warm import warm as warm_shared
@@ -16,6 +17,7 @@ def warm(*, has_contrast: bool = True) -> None:
         warm_shared()
         if has_contrast:
             warm_contrast()
+            warm_coils()
             project()
 
 

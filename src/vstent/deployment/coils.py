@@ -36,6 +36,8 @@ DENSEST_FRACTION: Final = 0.4
 """Largest packing density that may be asked for: about what is reached with a stent (40 +- 7 %, PMC3653595)."""
 GRID_MM, MOST_POINTS = 0.1, 600_000
 """Smallest spacing of the grid on which the distance to the wall is sampled, in mm, and number of its points."""
+ROUNDED: Final = 0.2
+"""What interpolation takes off thin struts in the distance from a stent, in spacings of that grid."""
 FRAMING_SHARE, FRAMING_TURN = 0.4, (np.pi / 3, 2 * np.pi / 3)
 """Largest share of the length that the framing coil is, and range of the angle by which its loops turn."""
 SMALLER, SMALLEST = 0.8, 0.3
@@ -51,9 +53,9 @@ SETTLING: Final = ((0.1, 300), (1.0, 300), (10.0, 200), (100.0, 200))
 """Drag and steps of one round of the search for balance; less drag moves loops, more lets contacts settle."""
 ROUNDS, BALANCED = 12, 0.05
 """Largest number of such rounds, and what may remain of the contact forces."""
-TRIES, LEAST_NODES, KINKED = 5, 12, 1.1
-"""Attempts to push in a coil, each from another place; number of nodes below which none entered; and bending radius,
-in wound diameters, below which it is kinked."""
+TRIES, ENOUGH, LEAST_NODES, KINKED = 5, 0.6, 12, 1.1
+"""Attempts to push in a coil, each from another place; part of it that is enough, so that a shorter coil is taken;
+number of nodes below which none entered; and bending radius, in wound diameters, below which it is kinked."""
 TIP_CLEARANCE: Final = 1.3
 """Distance of the tip of the catheter from the coils that is looked for, in wound diameters."""
 ZONE: Final = 2.0
@@ -138,7 +140,7 @@ def deploy_coils(
     is_full = False
     while not is_full:
         size = next_size(line, sac_mm3, sizes, total_mm - pushed.length_mm, given)
-        entered_mm = pushed.push(size, is_framing=not sizes) if size else 0.0
+        entered_mm = pushed.push(size, is_framing=not sizes, enough=1.0 if given else ENOUGH) if size else 0.0
         if size and not entered_mm and not given and size is not shortest:
             size, entered_mm = shortest, pushed.push(shortest, is_framing=not sizes)
         is_full = entered_mm == 0.0
@@ -218,17 +220,13 @@ class _Filling:
     def __init__(self, coil: Coil, aneurysm: Aneurysm, room: Room, total_mm: float, draw: Generator) -> None:
         self.wound_mm = wound_mm = coil.wound_diameter_um * MM_PER_UM
         self.room, self.draw, self.count = room, draw, 0
-        size = int(1.2 * total_mm / wound_mm) + 400
-        self.rods = rods.Rods(
-            np.zeros((size, 3)), np.zeros((size, 3)), np.zeros((size, 2)), np.zeros(size, bool), np.zeros(size, bool)
-        )
-        laws = wound_mm, TOUCHING * wound_mm, STRETCH * wound_mm, TWIST, 1 / SHARPEST, CONTACT
-        self.laws = rods.Laws(*laws)
+        self.rods, self.laws = _begun(int(1.2 * total_mm / wound_mm) + 400, wound_mm)
         plane = aneurysm.plane or aneurysm.mean_plane
         inner_mm = room.points_mm(room.distance_mm < -0.7 * wound_mm)
         height_mm = (inner_mm - plane.center_mm) @ plane.normal
         aside_mm = curves.lengths(inner_mm - plane.center_mm - height_mm[:, None] * plane.normal)
         is_near = (height_mm < 0.5 * height_mm.max(initial=0.0)) & (aside_mm < 0.7 * _half_width_mm(plane))
+        self.inner_mm = inner_mm[height_mm > 0]
         self.tips_mm, self.plane = inner_mm[is_near if is_near.any() else height_mm > 0], plane
 
     @property
@@ -236,34 +234,39 @@ class _Filling:
         """Length of all coils, in mm."""
         return float(self.rods.is_segment[: self.count].sum() * self.wound_mm)
 
-    def push(self, size: Size, *, is_framing: bool) -> float:
+    def push(self, size: Size, *, is_framing: bool, enough: float = ENOUGH) -> float:
         """Push in one coil, and return the length that has entered; 0 where none does.
 
-        Where it stalls or kinks, it is drawn back and pushed from another place; the longest attempt counts.
+        Where it stalls or kinks early, it is drawn back and pushed from another place; the longest attempt counts. Of
+        a coil that kinks the part before the kink counts, as a shorter coil.
         """
         entering, begin = round(size.length_mm / self.wound_mm), self.count
         before = [values.copy() for values in self.rods]
         best: list[Floats] = []
         best_count = begin
-        for _ in range(TRIES if len(self.tips_mm) else 0):
+        for number in range(TRIES if len(self.tips_mm) else 0):
             self._restore(before, begin)
-            direction = self._place(begin)
+            direction = self._place(begin, is_free=number > 0)
             self._curl(begin, entering + 3, 0.5 * size.free_diameter_mm, is_framing=is_framing)
             count = rods.advance(
                 self.rods, self.laws, begin + 2, self.room, DRAG, STEPS, direction, min(entering, self._space(begin))
             )[0]
-            self.count = count - 1  # without the node that is still in the catheter
-            self.rods.is_segment[self.count - 1 :] = False
-            self.rods.is_held[:] = False
-            rods.advance(self.rods, self.laws, self.count, self.room, *SETTLING[0], np.zeros(3), 0)
-            radius_mm = bend_radii_mm(self.rods.x[begin : self.count], np.array([0, self.count - begin]))
-            if radius_mm.min(initial=np.inf) < KINKED * self.wound_mm:
-                continue
-            if self.count > best_count:
+            self.count, is_kinked = count - 1, True  # without the node that is still in the catheter
+            for _ in range(3):
+                if self.count - begin < LEAST_NODES:
+                    break
+                self.rods.is_segment[self.count - 1 :] = self.rods.is_held[:] = False
+                rods.advance(self.rods, self.laws, self.count, self.room, *SETTLING[0], np.zeros(3), 0)
+                radius_mm = bend_radii_mm(self.rods.x[begin : self.count], np.array([0, self.count - begin]))
+                is_kinked = bool(radius_mm.min() < KINKED * self.wound_mm)
+                if not is_kinked:
+                    break
+                self.count = begin + int((radius_mm < KINKED * self.wound_mm).argmax())
+            if self.count > best_count and not is_kinked:
                 best, best_count = [values.copy() for values in self.rods], self.count
-            if self.count - begin > entering:
+            if self.count - begin > enough * entering:
                 break
-        if best_count - begin < min(LEAST_NODES, entering):
+        if best_count - begin < LEAST_NODES:
             self._restore(before, begin)
             return 0.0
         self._restore(best, best_count)
@@ -294,14 +297,18 @@ class _Filling:
             values[:] = earlier
         self.count = count
 
-    def _place(self, begin: int) -> Floats:
-        """Place the first two nodes of a coil in the catheter, away from other coils; return its direction."""
-        order = self.draw.permutation(len(self.tips_mm))[:400]
+    def _place(self, begin: int, *, is_free: bool) -> Floats:
+        """Place the first two nodes of a coil in the catheter, and return its direction.
+
+        They are near the neck, pointing at the dome, where it is clear of coils, or, if free, in the widest gap of all.
+        """
+        tips_mm = self.inner_mm if is_free else self.tips_mm
+        order = self.draw.permutation(len(tips_mm))[:400]
         others = cKDTree(self.rods.x[:begin]) if begin else cKDTree(np.full((1, 3), 1e9))
-        away_mm = np.asarray(others.query(self.tips_mm[order])[0])
-        is_clear = away_mm > TIP_CLEARANCE * self.wound_mm
-        tip_mm = self.tips_mm[order[is_clear.argmax() if is_clear.any() else away_mm.argmax()]]
-        direction = self.plane.normal + 0.4 * self.draw.normal(size=3)
+        away_mm = np.asarray(others.query(tips_mm[order])[0])
+        is_clear = (away_mm > TIP_CLEARANCE * self.wound_mm) & (not is_free)
+        tip_mm = tips_mm[order[is_clear.argmax() if is_clear.any() else away_mm.argmax()]]
+        direction = self.plane.normal * (not is_free) + 0.4 * self.draw.normal(size=3)
         direction /= np.linalg.norm(direction)
         across = np.cross(direction, self.draw.normal(size=3))
         self.rods.x[begin], self.rods.x[begin + 1] = tip_mm, tip_mm - self.wound_mm * direction
@@ -322,6 +329,21 @@ class _Filling:
             turn = angle[loop] + np.clip(4 * (place - loop) - 3, 0, 1) * (angle[loop + 1] - angle[loop])
         curl = self.wound_mm / radius_mm * np.stack([np.cos(turn), np.sin(turn)], axis=1)
         self.rods.natural[begin : begin + len(place)] = curl
+
+
+def _begun(size: int, wound_mm: float) -> tuple[rods.Rods, rods.Laws]:
+    """Return rods with room for so many nodes, of which there are none, and their numbers."""
+    nodes = np.zeros((size, 3)), np.zeros((size, 3)), np.zeros((size, 2)), np.zeros(size, bool), np.zeros(size, bool)
+    laws = wound_mm, TOUCHING * wound_mm, STRETCH * wound_mm, TWIST, 1 / SHARPEST, CONTACT
+    return rods.Rods(*nodes), rods.Laws(*laws)
+
+
+def warm() -> None:
+    """Call the kernel of coils once on a short rod."""
+    state, laws = _begun(8, 0.3)
+    state.x[:, 0], state.frame[:, 1], state.is_segment[:3] = 0.3 * np.arange(8), 1.0, True
+    room = Room(np.full((8, 8, 8), -1.0), np.zeros(3), 0.5)
+    rods.advance(state, laws, 4, room, DRAG, 1, np.array([1.0, 0.0, 0.0]), 1)
 
 
 def bend_radii_mm(points_mm: Floats, starts: Ints) -> Floats:
@@ -356,7 +378,7 @@ def _room(aneurysm: Aneurysm, inside: Sequence[Stent], wound_mm: float) -> Room:
         wires_mm = np.concatenate(list(_finely(stent, wire_mm)))  # drawn off the contour
         to_wires_mm = cKDTree(wires_mm).query(points_mm)[0]
         to_stent_mm = np.minimum(stent.contour.closed.signed_distance(points_mm), to_wires_mm)
-        distance_mm[is_inner] = np.maximum(distance_mm[is_inner], wire_mm - to_stent_mm)
+        distance_mm[is_inner] = np.maximum(distance_mm[is_inner], wire_mm + ROUNDED * room.spacing_mm - to_stent_mm)
     return room._replace(distance_mm=distance_mm)
 
 

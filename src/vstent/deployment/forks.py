@@ -18,7 +18,7 @@ from vstent.anatomy.restore.paths import on_path
 from vstent.deployment.contour import bilinear, normals, planes, untwisted
 from vstent.deployment.coverage import pore_areas_mm2, pore_places
 from vstent.deployment.wall import TreeWall, inner_nodes_mm, landing_wall
-from vstent.devices.design import Braid
+from vstent.devices.design import Braid, piece_length_mm
 from vstent.devices.formulas import grid
 from vstent.devices.stent import Stent, tube_faces
 from vstent.errors import LandingError
@@ -223,6 +223,17 @@ def _limit_mm(
     return limit_mm
 
 
+def pushed_mm(stent: Stent) -> float:
+    """Return the width of a cell that is pushed open as far as its struts allow, in mm.
+
+    They turn and keep their length: of all polygons with these sides the regular one holds the largest circle. A whole
+    cell has four of them; one that is open to a neighbor, because a crown between them is free, has eight.
+    """
+    sides = 4 if stent.design.joined_fraction == 1 else 8
+    half_mm = float(stent.pieces_mm[2].max())
+    return piece_length_mm(stent.design, stent.size) / float(np.tan(np.pi / sides)) - 2 * half_mm
+
+
 def _check(stent: Stent, cell: Passage) -> None:
     """Raise a LandingError where no stent can pass a cell."""
     if isinstance(stent.design, Braid):
@@ -234,7 +245,8 @@ def _check(stent: Stent, cell: Passage) -> None:
     if 2 * cell.radius_mm < CATHETER_MM:
         raise LandingError(
             f"The cell of {stent.design.name} through which the stent would pass is {2 * cell.radius_mm:.2f} mm wide, "
-            f"and a microcatheter {CATHETER_MM:g} mm. Move the first stent along the artery."
+            f"and a microcatheter {CATHETER_MM:g} mm. Its struts could turn until it is {pushed_mm(stent):.1f} mm, but "
+            "that is not modelled: move the first stent along the artery, or begin the second at the fork (@ fork)."
         )
 
 

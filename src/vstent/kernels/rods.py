@@ -26,10 +26,13 @@ BALANCED: Final = 0.02
 """Norm of the forces that remain over that of the contact forces, below which the rods are in balance."""
 DEEP, PATIENCE = 0.15, 400
 """Depth of a contact, in diameters, at which the pushing waits, and number of steps that it does."""
-ACTIVE, EVERY = 300, 4
+ACTIVE, EVERY = 250, 10
 """Number of nodes, those that entered last, that move in every step while a rod enters; all do in one of so many."""
-TIGHT: Final = 0.05
-"""Relative change of length of the segment that leaves the catheter at which the pushing waits."""
+TIGHT: Final = 0.002
+"""Relative change of length of the segment that leaves the catheter at which the pushing waits: the force, with the
+stiffness of stretch, at which a coil is bent to about 1.3 wound diameters."""
+SHARP, LASTING = 1.2, 10
+"""Curvature times segment length at which a coil is kinked, and number of segments for which it is until that ends."""
 SLACK: Final = 0.4
 """Gap, in diameters, up to which segments are listed as close."""
 LARGEST_STEP: Final = 0.15
@@ -490,6 +493,22 @@ def _strain(rods: Any, laws: Any, n: int) -> float:
 
 
 @njit(cache=True, error_model="numpy")
+def _sharpest(rods: Any, first: int, n: int) -> float:
+    """Return the largest curvature times segment length of the nodes from `first` on."""
+    sharpest = 0.0
+    for j in range(first + 1, n - 1):
+        if not (rods.is_segment[j - 1] and rods.is_segment[j]):
+            continue
+        along, before, after = 0.0, 0.0, 0.0
+        for c in range(3):
+            a, b = rods.x[j, c] - rods.x[j - 1, c], rods.x[j + 1, c] - rods.x[j, c]
+            along, before, after = along + a * b, before + a * a, after + b * b
+        cosine = min(max(along / np.sqrt(before * after), -0.999), 1.0)
+        sharpest = max(sharpest, 2 * np.sqrt((1 - cosine) / (1 + cosine)))
+    return sharpest
+
+
+@njit(cache=True, error_model="numpy")
 def _feed(rods: Any, laws: Any, n: int, push: Any, part: int, steps: int) -> int:
     """Advance the nodes in the catheter by a part of a segment, with a new node for the first; return how many are."""
     if part == 0:
@@ -511,9 +530,10 @@ def advance(rods: Any, laws: Any, n: int, room: Any, drag: float, steps: int, pu
     """Push nodes out of a catheter while all rods move, and return the number of nodes.
 
     The last two nodes are held in the catheter, the last but one at its tip; `push` (3,) is its direction. Each of the
-    `entering` nodes advances by a segment in so many `steps`, and waits where a contact is `DEEP`. It ends where that
-    lasts. With none entering, the rods move towards equilibrium, at most `steps` times, until they are `BALANCED`.
-    Also returned are the imbalance of the forces and the largest depth of a contact at any time.
+    `entering` nodes advances by a segment in so many `steps`, and waits where a contact is `DEEP` or the segment is
+    `TIGHT`. It ends where that, or a kink, lasts. With none entering, the rods move towards equilibrium, at most
+    `steps` times, until they are `BALANCED`. Also returned are the imbalance of the forces and the largest depth of a
+    contact at any time.
     """
     field, low, spacing = room
     size = len(rods.x)
@@ -525,12 +545,13 @@ def advance(rods: Any, laws: Any, n: int, room: Any, drag: float, steps: int, pu
     x, frame = rods.x.copy(), rods.frame.copy()
     least = drag
     moved, of_others, before, imbalance, worst, waited, done = np.inf, np.inf, np.inf, np.inf, 0.0, 0, 0
-    while done < steps * max(entering, 1) and waited < PATIENCE:
+    ticks, kinked = 0, 0
+    while done < steps * max(entering, 1) and waited < PATIENCE and kinked < LASTING:
         if moved + of_others > 0.5 * SLACK * laws.diameter:
             start = 0 if of_others > 0.25 * SLACK * laws.diameter else max(n - ACTIVE - 1, 0)
             _list_pairs(rods, start, n, laws, low, shape, near, count)
             moved, of_others = 0.0, of_others if start else 0.0
-        first = max(0, n - ACTIVE) if entering > 0 and done % EVERY else 0
+        first = max(0, n - ACTIVE) if entering > 0 and ticks % EVERY else 0
         energy, pressed, deepest = forces(rods, laws, first, n, room, near, count, work)
         if entering == 0 and energy > before and drag < 1e4:
             rods.x[:n], rods.frame[:n], drag, before = x[:n], frame[:n], 4.0 * drag, np.inf
@@ -544,8 +565,10 @@ def advance(rods: Any, laws: Any, n: int, room: Any, drag: float, steps: int, pu
         moves = _step(rods, laws, first, n, work, drag)
         moved, of_others = moved + moves[0], of_others + moves[1]
         if entering > 0:
-            waited += 1
+            waited, ticks = waited + 1, ticks + 1
             if deepest < DEEP * laws.diameter and _strain(rods, laws, n) < TIGHT:
+                if done % steps == 0:
+                    kinked = kinked + 1 if _sharpest(rods, max(0, n - ACTIVE), n - 2) > SHARP else 0
                 n = _feed(rods, laws, n, push, done % steps, steps)
                 moved = np.inf if done % steps == 0 else moved + laws.segment / steps
                 done, waited = done + 1, 0

@@ -4,22 +4,25 @@ Four causes are varied, each uniformly within plus or minus its range and indepe
 the scan (all diameters), the landing position, the manufactured diameter of the device, and the mean inflow. The
 numbers of the device vary with them, each within its range in the catalogue (`vstent.devices.ranges`). Points are those
 of a Sobol sequence, each in the middle of its stratum. Every cause alone is thus sampled evenly, and
-the same study gives the same result.
+the same study gives the same result. Of coils the seed varies alone.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, Final
 
 import numpy as np
 
+from vstent.deployment.coils import deploy_coils
 from vstent.deployment.deploy import deploy
 from vstent.deployment.measure import measure
 from vstent.devices.design import Design, Size
 from vstent.devices.ranges import altered, values_at
-from vstent.devices.stent import Deployment, Landing, Stent
+from vstent.devices.stent import Coils, Deployment, Landing, Stent
 from vstent.errors import DeviceError, InputError, LandingError
-from vstent.flow.indices import indices, ratios
+from vstent.flow.case import FlowField
+from vstent.flow.indices import between_coils, indices, ratios
 from vstent.flow.ostium import sac_surfaces
 from vstent.flow.problem import flow_case
 from vstent.flow.settings import FlowSettings
@@ -41,6 +44,8 @@ RESULTS: Final = (
     "neck_pore_density_per_mm2",
 )
 """Measures of the deployment for which intervals are computed."""
+COIL_RESULTS: Final = ("packing_density_fraction", "neck_density_fraction", "neck_covered_by_coils_fraction")
+"""Measures of coils for which intervals are computed."""
 FLOW_RESULTS: Final = (
     "neck_inflow_mL_s_ratio",
     "neck_inflow_in_sac_mL_s_ratio",
@@ -98,6 +103,8 @@ class Uncertainty:
         """Return the share of each cause alone in a result's variance, and the rest; empty if samples are too few."""
         points, values = self._found(name)
         varied = np.flatnonzero(self.ranges > 0)
+        if not len(varied):
+            return {"rest": 1.0}  # seeds
         found = first_order_shares(points[:, varied], values)
         if found is None:
             return {}
@@ -157,27 +164,74 @@ def vary(
             f"a device with a free diameter of {free_mm:.2f} mm is not made {ranges.device_mm:g} mm wider or "
             f"narrower: give a range below {WIDEST_FRACTION * free_mm:.2f} mm"
         )
-    rows: list[Mapping[str, Floats]] = []
-    for number, point in enumerate(points):
-        wanted = flow if number < ranges.flow_samples else None
-        store = checkpoint if wanted is not None else None  # others are computed faster than they are read back
-        stored = None if store is None else store.load(f"sample-{number}")
-        if stored is None:
-            made = values_at(numbers, point[len(CAUSES) :])
-            sample = _sample(anatomy, deployment.stent, point[: len(CAUSES)] * spread, made, wanted)
-            stored = {result: np.array(value) for result, value in sample.items()}
-            if store is not None:
-                store.save(f"sample-{number}", stored)
-        rows.append(stored)
-        if progress is not None:
-            progress(number + 1, len(points))
-    names = tuple(name for name in (*RESULTS, *FLOW_RESULTS) if any(name in row for row in rows))
-    values = np.array([[row.get(name, np.nan) for name in names] for row in rows], dtype=np.float64)
+
+    def sample(number: int, wanted: FlowSettings | None) -> dict[str, float]:
+        made = values_at(numbers, points[number, len(CAUSES) :])
+        return _sample(anatomy, deployment.stent, points[number, : len(CAUSES)] * spread, made, wanted)
+
+    names, values = _results(sample, len(points), ranges, flow, progress, checkpoint)
     half = [0.5 * (one.high - one.low) for one in numbers]
     told = tuple(one.name for one in numbers)
     plane = anatomy.aneurysms[0].plane if anatomy.aneurysms else None
     neck_mm2 = None if plane is None else (plane.area_mm2, *plane.area_band_mm2)
-    return Uncertainty(np.append(spread, half), points, names, values.reshape(len(points), len(names)), told, neck_mm2)
+    return Uncertainty(np.append(spread, half), points, names, values, told, neck_mm2)
+
+
+def vary_seeds(
+    anatomy: Anatomy,
+    coils: Coils,
+    ranges: Ranges,
+    *,
+    flow: FlowSettings | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    checkpoint: Checkpoint | None = None,
+) -> Uncertainty:
+    """Place the same coils with other seeds; all else is as in `vary`, and nothing else varies."""
+
+    @cache
+    def bare(settings: FlowSettings) -> FlowField:
+        return simulate_case(flow_case(anatomy, (), settings))
+
+    def sample(number: int, wanted: FlowSettings | None) -> dict[str, float]:
+        placed = deploy_coils(coils.design.key, anatomy, coils.coils, seed=coils.seed + number)
+        measures = measure(anatomy, placed)
+        found = {name: float(measures[name]) for name in COIL_RESULTS}
+        if wanted is None:
+            return found
+        shapes, porosity = sac_surfaces(anatomy), 1.0 - found["packing_density_fraction"]
+        after = indices(simulate_case(flow_case(anatomy, (placed.stent,), wanted), start=bare(wanted)), *shapes)
+        after = after if wanted.numerics.resolve_wires else between_coils(after, porosity)
+        changes = ratios(indices(bare(wanted), *shapes), after)
+        return found | {name: changes[name] for name in FLOW_RESULTS if name in changes}
+
+    names, values = _results(sample, ranges.samples, ranges, flow, progress, checkpoint)
+    return Uncertainty(np.zeros(len(CAUSES)), np.zeros((len(values), len(CAUSES))), names, values)
+
+
+def _results(
+    sample: Callable[[int, FlowSettings | None], dict[str, float]],
+    count: int,
+    ranges: Ranges,
+    flow: FlowSettings | None,
+    progress: Callable[[int, int], None] | None,
+    checkpoint: Checkpoint | None,
+) -> tuple[tuple[str, ...], Floats]:
+    """Return the names (k) and values (n, k) of the results of samples; those with a flow are stored."""
+    rows: list[Mapping[str, Floats]] = []
+    for number in range(count):
+        wanted = flow if number < ranges.flow_samples else None
+        store = checkpoint if wanted is not None else None  # others are computed faster than they are read back
+        stored = None if store is None else store.load(f"sample-{number}")
+        if stored is None:
+            stored = {result: np.array(value) for result, value in sample(number, wanted).items()}
+            if store is not None:
+                store.save(f"sample-{number}", stored)
+        rows.append(stored)
+        if progress is not None:
+            progress(number + 1, count)
+    names = tuple(name for name in (*RESULTS, *COIL_RESULTS, *FLOW_RESULTS) if any(name in row for row in rows))
+    values = np.array([[row.get(name, np.nan) for name in names] for row in rows], dtype=np.float64)
+    return names, values.reshape(count, len(names))
 
 
 def made_wider(design: Design, size: Size, by_mm: float) -> Size:

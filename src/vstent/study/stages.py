@@ -46,7 +46,7 @@ from vstent.io.images import read_image
 from vstent.kernels.arrays import Floats
 from vstent.plan.bands import bands
 from vstent.plan.treatments import rank_treatments
-from vstent.plan.uncertainty import Uncertainty, vary
+from vstent.plan.uncertainty import Uncertainty, vary, vary_seeds
 from vstent.study.folder import flow_folder
 from vstent.study.keys import ALONE, ANATOMY, STRAIGHTENED, VESSEL, flow_stage, stage_name, yields
 from vstent.study.outputs import write_field
@@ -410,8 +410,8 @@ def vary_all(
         if len(deployed) != 1:
             continue
         (deployment,) = deployed.values()
-        if isinstance(deployment.stent.design, Basket | Coil):
-            store.progress(stage, 1.0, "left out: devices in sacs are not varied.")
+        if isinstance(deployment.stent.design, Basket):
+            store.progress(stage, 1.0, "left out: baskets are not varied.")
             continue
         varied = store.find(stage, keys[stage], Uncertainty)
         if varied is None:
@@ -421,8 +421,12 @@ def vary_all(
 
             with store.stage(stage) as tell:
                 begun = store.unfinished(stage, keys[stage])
-                anatomy = on_path(anatomy, deployment.stent.path)
-                varied = vary(anatomy, deployment, settings.uncertainty, flow=flow, progress=told, checkpoint=begun)
+                how: dict[str, Any] = {"flow": flow, "progress": told, "checkpoint": begun}
+                if isinstance(deployment.stent, Coils):
+                    varied = vary_seeds(anatomy, deployment.stent, settings.uncertainty, **how)
+                else:
+                    anatomy = on_path(anatomy, deployment.stent.path)
+                    varied = vary(anatomy, deployment, settings.uncertainty, **how)
                 tell(f"{len(varied.points)} deployments; {varied.n_failed} of them did not fit.")
             store.save(stage, keys[stage], varied)
         spreads[treatment.name] = varied.metrics()
