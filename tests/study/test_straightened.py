@@ -1,0 +1,73 @@
+"""A study in which the artery yields: metrics, files, notes, resumption, and the rigid artery as before."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from faults import artery
+
+from vstent.devices.treatment import read_treatment
+from vstent.errors import InputError
+from vstent.flow.settings import FlowSettings, Numerics
+from vstent.io.writers import write_stl
+from vstent.study.pipeline import run
+from vstent.study.settings import Settings
+
+FLOW = FlowSettings(numerics=Numerics(cell_size_mm=0.5, max_steps=400))
+
+
+def settings(*treatments: str, straightening: str, flow: FlowSettings | None = None) -> Settings:
+    """Settings of a study."""
+    return Settings(treatments=tuple(map(read_treatment, treatments)), flow=flow, straightening=straightening)
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The demo's artery as a file."""
+    path = tmp_path_factory.mktemp("source") / "artery.stl"
+    write_stl(path, artery())
+    return path
+
+
+def test_the_rigid_artery_stays_as_it_is(source: Path, tmp_path: Path) -> None:
+    rigid = run(source, tmp_path / "rigid", settings("enterprise", straightening="off"))
+    yielded = run(source, tmp_path / "yielded", settings("enterprise", straightening="immediate"))
+    added = yielded.metrics["treatments"]["enterprise"].pop("straightening")
+    assert rigid.metrics == yielded.metrics
+    assert added["straightened_low_rad"] < added["straightened_rad"] < added["straightened_high_rad"]
+    (note,) = [note for note in yielded.notes if note.startswith("Straightening, enterprise: ")]
+    is_unsure = added["straightened_high_rad"] - added["straightened_low_rad"] > added["straightened_rad"]
+    assert ("The band is wider than the effect." in note) == is_unsure
+    folder = tmp_path / "yielded" / "treatments" / "enterprise" / "straightened"
+    assert {file.name for file in folder.iterdir()} >= {"vessel.vtp", "sac.vtp", "landing_surface.vtp"}
+    assert not (tmp_path / "rigid" / "treatments" / "enterprise" / "straightened").exists()
+    stages: list[str] = []
+    again = settings("enterprise", straightening="immediate")
+    run(source, tmp_path / "yielded", again, lambda now: stages.append(f"{now.stage} {now.detail}"))
+    assert "straighten enterprise already done" in stages
+    with pytest.raises(InputError, match="holds results with other straightening"):
+        run(source, tmp_path / "yielded", replace(again, straightening="six_months"))
+
+
+def test_a_treatment_at_a_fork_or_in_a_sac_does_not_stop_the_others(source: Path, tmp_path: Path) -> None:
+    """Coils in the sac follow it; a sac filled by them alone straightens nothing."""
+    found = run(source, tmp_path, settings("enterprise + coils(4%)", "coils(4%)", straightening="4deg"))
+    treatments = found.metrics["treatments"]
+    assert "straightening" in treatments["enterprise+coils"]
+    assert "straightening" not in treatments["coils"]
+    assert not found.failures
+
+
+def test_both_effects_have_their_flow(source: Path, tmp_path: Path) -> None:
+    found = run(source, tmp_path, settings("enterprise", straightening="12deg", flow=FLOW))
+    treatment = found.metrics["treatments"]["enterprise"]
+    alone, both = treatment["straightening"]["bare"]["change"], treatment["straightening"]["change"]
+    ratio = "mean_sac_velocity_m_s_ratio"
+    assert len({treatment["change"][ratio], alone[ratio], both[ratio]}) == 3
+    assert set(found.fields) == {"bare", "enterprise"}
+    (note,) = [note for note in found.notes if note.startswith("Straightening, enterprise: ")]
+    assert note.endswith(f" {alone[ratio] - 1:+.0%} by straightening, {both[ratio] - 1:+.0%} by both.")
+    for part in ("flow", "straightened/flow", "straightened/bare/flow"):
+        assert (tmp_path / "treatments" / "enterprise" / part / "field.vtu").is_file()
+    assert json.loads((tmp_path / "metrics.json").read_text())["treatments"]["enterprise"]["straightening"]["bare"]
