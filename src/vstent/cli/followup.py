@@ -36,7 +36,10 @@ def _compare(arguments: argparse.Namespace) -> int:
     if name not in names:
         raise InputError(f"{out} has no treatment {name!r}: choose one of {', '.join(names)}.")
     anatomy, stents = stents_of(out, [name])
-    found = compare_followup(anatomy, stents[name][0], arguments.followup, arguments.metal)
+    devices = [one for one in stents[name] if one.design.kind in ("braid", "laser_cut")]
+    if not devices:
+        raise InputError(f"{name} has no device in the artery: only these are compared.")
+    found = compare_followup(anatomy, devices[0], arguments.followup, arguments.metal)
     writers.write_json(out / "followup.json", found.metrics())
     draw_followup(out / "followup.png", anatomy, found)
     console.print(followup_table(found))

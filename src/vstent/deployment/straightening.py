@@ -89,7 +89,9 @@ class Straightening:
 
 def described(measures: Mapping[str, Any]) -> str:
     """Return the metrics of a straightening as sentences; a band that is wider than the effect comes first."""
-    value, low, high = (float(np.degrees(measures[f"straightened{end}_rad"])) for end in ("", "_low", "_high"))
+    value, low, high = (
+        round(float(np.degrees(measures[f"straightened{end}_rad"])), 1) + 0.0 for end in ("", "_low", "_high")
+    )
     first = "The band is wider than the effect. " if high - low > abs(value) else ""
     band = f" ({low:.0f} to {high:.0f})" if high > low else ""
     before_mm, after_mm = measures["bend_radius_before_mm"], measures["bend_radius_after_mm"]

@@ -6,11 +6,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vstent.anatomy.read import read_vessel
+from vstent.anatomy.restore.paths import on_path
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
 from vstent.deployment.straightening import measured
 from vstent.devices.stent import Stent
+from vstent.errors import InputError
 from vstent.geometry.image import Image
 from vstent.geometry.registration import Pose, registered, settled
 from vstent.geometry.vessel import Anatomy, Vessel
@@ -42,25 +44,12 @@ class Followup(NamedTuple):
 
     def metrics(self) -> dict[str, Any]:
         """Return all numbers for a file."""
-        move = {"residual_mm": self.pose.residual_mm, "turn": self.pose.turn.tolist()}
-        return {
-            "registration": move | {"shift_mm": self.pose.shift_mm.tolist()},
-            "planned": self.planned,
-            "real": self.real,
-        }
+        return {"registration": self.pose._asdict(), "planned": self.planned, "real": self.real}
 
 
 def compare_followup(anatomy: Anatomy, stent: Stent, path: Path, metal: float | None = None) -> Followup:
-    """Compare a planned device with a scan or surface after the treatment.
-
-    Parameters
-    ----------
-    anatomy : the artery of the plan, the path of the device first.
-    stent : the device as planned.
-    path : scan or surface after the treatment.
-    metal : intensity from which voxels of a scan are metal; None: the device is not measured.
-    """
-    vessel = read_vessel(path)
+    """Compare a planned device with a scan or surface; voxels from the intensity `metal` on are the real one."""
+    anatomy, vessel = on_path(anatomy, stent.path), read_vessel(path)
     first_pose = registered(anatomy.vessel.lumen.vertices_mm, vessel.lumen)
     pose = settled(_outside_mm(anatomy, stent), vessel.lumen, first_pose)
     after = _artery(anatomy, vessel, pose)
@@ -71,10 +60,9 @@ def compare_followup(anatomy: Anatomy, stent: Stent, path: Path, metal: float | 
     if not after.aneurysms:
         at_mm = float(other.nearest_abscissa_mm(pose.of(axis.at(np.array([middle_mm]))))[0])
     after_mm = ends_mm[0] - middle_mm + at_mm, ends_mm[1] - middle_mm + at_mm
-    planned: dict[str, float] = {}
-    real: dict[str, float] = {}
-    for found, line, ends in ((planned, axis, ends_mm), (real, other, after_mm)):
-        found["arms_angle_rad"], found["bend_radius_mm"] = measured(curves.resample(line.points_mm, STEP_MM), ends)
+    lines_mm = [curves.resample(line.points_mm, STEP_MM) for line in (axis, other)]
+    shapes = measured(lines_mm[0], ends_mm), measured(lines_mm[1], after_mm)
+    planned, real = (dict(zip(("arms_angle_rad", "bend_radius_mm"), one, strict=True)) for one in shapes)
     if metal is not None:
         radius_mm = 0.5 * stent.row_diameter_mm
         gap_mm = np.interp(stent.row_abscissa_mm, axis.abscissa_mm, anatomy.parent.section_radius_mm) - radius_mm
@@ -116,6 +104,8 @@ def _metal(image: Image, metal: float, after: Anatomy) -> tuple[Floats, Floats, 
     along_mm, off_mm = curves.project(path.axis.points_mm, points_mm)
     radius_mm = np.interp(along_mm, path.axis.abscissa_mm, path.section_radius_mm)
     is_in = (off_mm < WITHIN * radius_mm) & (along_mm > 0) & (along_mm < path.axis.length_mm)
+    if not is_in.any():
+        raise InputError(f"No voxel in or near the artery has an intensity of {metal:g} or more: give another --metal.")
     return along_mm[is_in], off_mm[is_in], (radius_mm - off_mm)[is_in]
 
 
