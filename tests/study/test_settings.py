@@ -25,6 +25,7 @@ NO_OPTION = {
     "treatments.implants.inside": IN_TEXT,
     "treatments.implants.placing.path": IN_TEXT,
     "treatments.implants.density_fraction": IN_TEXT,
+    "treatments.implants.coils": IN_TEXT,
     "treatments.implants.seed": IN_TEXT,
     "treatments.implants.placing.at_fork": IN_TEXT,
     "treatments.implants.placing.beside": IN_TEXT,
