@@ -140,7 +140,7 @@ ALL = Settings(
                 Implant("a", "silk", 4.0, 20.0, Placing("outlet_2", 1 / 3, "distal")),
                 Implant("b", "silk", placing=Placing(shift_mm=-4.0), inside=("a",)),
                 Implant("c", "silk", placing=Placing("outlet_1", at_fork=True, beside=("outlet_2",)), inside=("a",)),
-                Implant("d", "coils", density_fraction=0.2, seed=3),
+                Implant("d", "coils", density_fraction=0.2, coils=((2.0, 1 / 3),), seed=3),
             ),
             has_flow=False,
         ),
