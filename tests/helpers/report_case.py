@@ -200,6 +200,7 @@ def case(name="Bent tube with a sac"):
         notes=("Units were guessed as mm from the size of the artery.",),
         keys={},
         whole=None,
+        straightened={},
     )
 
 

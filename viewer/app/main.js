@@ -756,7 +756,7 @@ const LAYERS = {
   flow: (page) => {
     const mode = page.memory.mode || "streamlines";
     const modes = ["streamlines", "slice", "shear", "sac_shear"].map((id) => ({ id, on: mode === id }));
-    return [{ ...LUMEN, on: mode !== "shear" }, ...modes, { id: "wires", title: "Wires", on: false }, NECK];
+    return [{ ...LUMEN, on: mode !== "shear" }, ...modes, { id: "wires", title: "Wires", on: false }, { id: "straightened", title: "Straightened", on: true }, NECK];
   },
   report: (page) => LAYERS.flow(page),
 };

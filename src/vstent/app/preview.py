@@ -44,6 +44,7 @@ from vstent.flow.simulation import foretell_cost
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import PARENT, Anatomy, Opening
 from vstent.io.archive import load_data
+from vstent.io.surfaces import read_surface
 from vstent.kernels import triangles
 from vstent.kernels.arrays import Floats
 from vstent.plan.bands import gap_bands
@@ -58,12 +59,13 @@ from vstent.reporting.scene import (
     implant_titles,
     node_coverage,
     scales_of,
+    straightened_layer,
     treatment_title,
     view_of,
     views_of,
 )
 from vstent.reporting.uncertainty import band_rows, how_sure
-from vstent.study.folder import CACHE
+from vstent.study.folder import CACHE, straightened_folder
 from vstent.study.keys import stage_name, study_keys
 from vstent.study.stages import ask_for_aneurysm, bands_of, deploy_implant, landing_of, size_of
 from vstent.study.store import Store
@@ -514,6 +516,9 @@ class Preview:
             if not paths:
                 raise ReadError("Some flows of these results are missing. Run the step Flow.")
             layers = [layer for name, path in paths.items() for layer in self._flow_layers(name, path, moment)]
+            for name in paths:
+                wall = straightened_folder(self.case.folder, name) / "vessel.vtp"
+                layers += [straightened_layer(name, read_surface(wall, units="mm")[0])] if wall.exists() else []
             of_scales, phases = layers, self._loaded(next(iter(paths.values())), FlowField).phases
             if cut_mm is not None:
                 layers = [cut(name, self._flow(path, moment), self.anatomy, cut_mm) for name, path in paths.items()]

@@ -160,9 +160,15 @@ Implants = Mapping[str, Mapping[str, Deployment]]
 """Deployed implants by treatment and id."""
 
 
-def scene_of(anatomy: Anatomy, implants: Implants, flows: Mapping[str, FlowField]) -> Scene:
-    """Return the scene of a case, decimated to the resolution of a screen."""
+def scene_of(
+    anatomy: Anatomy,
+    implants: Implants,
+    flows: Mapping[str, FlowField],
+    straightened: Mapping[str, Surface] | None = None,
+) -> Scene:
+    """Return the scene of a case, decimated to the resolution of a screen; lumens that have yielded are faint."""
     layers = anatomy_layers(anatomy)
+    layers += [straightened_layer(name, lumen) for name, lumen in (straightened or {}).items()]
     deployments = [(name, one) for name, deployed in implants.items() for one in deployed.values()]
     for name, deployment in deployments:
         stent = deployment.stent
@@ -185,6 +191,11 @@ def scene_of(anatomy: Anatomy, implants: Implants, flows: Mapping[str, FlowField
         is_oriented=anatomy.vessel.is_oriented,
         fade_mm=1.2 * float(np.median(anatomy.parent.section_radius_mm)),
     )
+
+
+def straightened_layer(name: str, lumen: Surface) -> MeshLayer:
+    """Return the layer of a lumen that has yielded to a treatment."""
+    return MeshLayer("straightened", name, NECK_COLOUR, thin_surface(lumen, 20_000)[0], 0.12)
 
 
 def device_title(deployment: Deployment) -> str:

@@ -19,6 +19,7 @@ from vstent.flow.convergence import Sensitivity, convergence
 from vstent.flow.problem import flow_case
 from vstent.flow.settings import FlowSettings
 from vstent.flow.simulation import check_engine
+from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io import writers
 from vstent.study import outputs, stages
@@ -54,6 +55,8 @@ class Computed:
     """Flows by treatment, ``bare`` first; empty where no flow was requested."""
     whole: Vessel | None
     """The vessel before it was trimmed; None where it is not stored."""
+    straightened: Mapping[str, Surface]
+    """Lumens that have yielded to treatments, by their names."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +146,8 @@ def run(
         fields = {name: field for name, field in flows.items() if "/" not in name}
         failures |= unflown
         varied = stages.vary_all(anatomy, implants, settings, store, keys)
-        computed = Computed(anatomy, implants, fields, store.load(VESSEL, keys[VESSEL], Vessel))
+        lumens = {name: one.anatomy.vessel.lumen for name, one in yielded.items()}
+        computed = Computed(anatomy, implants, fields, store.load(VESSEL, keys[VESSEL], Vessel), lumens)
 
         def measures() -> dict[str, Any]:
             progress(Progress("measure", 0.0, computed=computed))
