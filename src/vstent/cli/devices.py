@@ -22,7 +22,7 @@ def add(commands: options.Commands) -> None:
     parser.set_defaults(command=_devices)
     commands_of_devices = parser.add_subparsers(metavar="COMMAND")
     text = "Print the entry of a device: copy it to make one of your own."
-    showing = options.add_command(commands_of_devices, "entry", text, "devices entry silk > mine.toml")
+    showing = options.add_command(commands_of_devices, "entry", text, "devices entry silk")
     showing.add_argument("device", help="key or name of the device")
     showing.set_defaults(command=_entry)
     text = "Add devices of your own to the catalogue."
