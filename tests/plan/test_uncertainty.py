@@ -290,7 +290,7 @@ def test_a_study_tells_its_uncertainty_in_metrics_report_and_table_and_goes_on_f
     page = (out / "report.html").read_text()
     section = page[page.index('<section id="uncertainty">') : page.index('<section id="notes">')]
     assert "all diameters ±0.200\u202fmm" in section
-    assert f"{interval['low']:.1f}\u202fmm and {interval['high']:.1f}\u202fmm" in section
+    assert f"{interval['low']:.1f} to {interval['high']:.1f}\u202fmm" in section
     before = (out / "metrics.json").read_bytes()
     next((out / CACHE).glob(f"{RECORD}-*")).unlink()  # so that the command is not answered from its record
     assert main(command) == 0

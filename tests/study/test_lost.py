@@ -245,7 +245,7 @@ def test_a_flow_that_diverges_is_a_row_with_its_reason(
     case = run(arteries[0], out, settings, quiet)
     assert set(case.fields) == {"bare", "enterprise"}
     assert case.failures == {"leo": "flow not computed: the flow diverged: use a finer grid spacing"}
-    assert case.metrics["treatments"]["leo"].keys() == {"implants", "jailed_branches"}
+    assert case.metrics["treatments"]["leo"].keys() == {"implants", "together", "jailed_branches"}
 
 
 def test_keys_change_with_what_a_stage_uses_and_with_nothing_else() -> None:
