@@ -10,7 +10,8 @@ from vstent.anatomy.restore.paths import on_path
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
-from vstent.deployment.straightening import measured
+from vstent.deployment.motion import OFF_WALL_MM
+from vstent.deployment.straightening import STEP_MM, measured
 from vstent.devices.stent import Stent
 from vstent.errors import InputError
 from vstent.geometry.image import Image
@@ -20,12 +21,8 @@ from vstent.io.images import read_image
 from vstent.kernels import curves
 from vstent.kernels.arrays import Floats
 
-OFF_WALL_MM = 0.25
-"""Distance outside the landing surface, in mm, from which the lumen is not wall of the artery."""
 BESIDE_MM = 2.0
 """Distance from the ends of the device beyond which the artery is registered, in mm."""
-STEP_MM = 0.5
-"""Distance between points at which the curvature is measured, in mm."""
 WITHIN = 1.5
 """Largest distance of metal from the axis, in radii of the artery."""
 
