@@ -106,7 +106,7 @@ def test_womersleys_flow_on_two_levels_is_womersleys_flow() -> None:
         assert phase.inflow_mL_s == pytest.approx(inflow_mL_s * PULSE.factor(np.array([phase.time_s]))[0], rel=2e-3)
         exact = womersley_m_s(1e-3 * np.hypot(x, y), phase.time_s)[:, None] * [0, 0, 1]
         error = (phase.velocity_m_s[-1] - exact)[within] / peak_m_s
-        assert np.sqrt((error**2).sum(axis=1).mean()) < 0.004
+        assert np.sqrt((error**2).sum(axis=1).mean()) < 0.005
         assert np.abs(error).max() < 0.025
 
 

@@ -73,10 +73,12 @@ RIDGE: Final = 1e-3
 class Stencil:
     """Interpolation from cells of one grid to cells of another."""
 
+    place: Ints
+    """(c,) storage places of the cells read."""
     start: Ints
     """(n + 1,) first entry of each target cell."""
-    place: Ints
-    """(e,) storage places of the cells read."""
+    cell: Ints
+    """(e,) number, among these cells, of the one read."""
     weight: NDArray[np.float32]
     """(e, 2) weights of the even and of the odd part of the populations."""
     target: Ints
@@ -296,8 +298,10 @@ def stencil(read: Grid, written: Grid, target: Ints) -> Stencil:
     is_used, cell, even, odd, target = (values[is_near] for values in (is_used, cell, even, odd, target))
     start = np.r_[0, np.cumsum(is_used.sum(axis=1))].astype(np.int32)
     weight = np.stack([even[is_used], odd[is_used]], axis=1).astype(np.float32)
-    places = read.addressing.place[cell[is_used]], written.addressing.place[target]
-    return Stencil(start, places[0], weight, places[1], written.limit[target])
+    place, number = np.unique(read.addressing.place[cell[is_used]], return_inverse=True)
+    return Stencil(
+        place, start, number.astype(np.int32), weight, written.addressing.place[target], written.limit[target]
+    )
 
 
 def _beside_wall(source: Domain, other: Domain, target: Ints, cell: Ints, away: Floats) -> tuple[Floats, Floats]:

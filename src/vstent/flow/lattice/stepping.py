@@ -406,7 +406,7 @@ def _carry(source: State, target: State, along: Stencil, ratio: float) -> None:
     scales, rates = source.scales, (np.float32(source.scales.odd_rate), np.float32(target.scales.odd_rate))
     numbers = np.float32(ratio), np.float32(scales.relaxation_steps), scales.thinning, *rates
     into = target.populations, target.addressing.stride, along.target, along.limit
-    read = along.start, along.place, along.weight
+    read = along.place, along.start, along.cell, along.weight
     exchange.carry(source.populations, source.addressing.stride, read, into, numbers)
 
 

@@ -14,59 +14,68 @@ from vstent.kernels.directions import VELOCITIES
 
 _HALF = np.float32(0.5)
 _AXES: Final = VELOCITIES.astype(np.float32)
+_EVEN: Final = 16
+"""Number of values per cell that are interpolated with the weights of the even part: those before the odd part."""
+_VALUES: Final = 25
+"""Number of values per cell: rest population, half sums of pairs (9), products u u (6), half differences (9)."""
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
-def carry_cell(i: int, f: Any, stride: int, stencil: Any, into: Any, numbers: Any, held: Any) -> None:
-    """Apply `carry` to target cell `i`; `held` (19,) is a work array."""
-    start, place, weight = stencil
-    g, new_stride, new_place, limit = into
-    ratio, time, law, odd_rate, new_odd_rate = numbers
-    held[:] = np.float32(0.0)
-    xx = yy = zz = xy = xz = yz = np.float32(0.0)
-    for e in range(start[i], start[i + 1]):
-        at, even, odd = place[e], weight[e, 0], weight[e, 1]
-        held[0] += even * f[at]
-        x = y = z = np.float32(0.0)
-        for q in range(1, 19, 2):
-            first, second = f[q * stride + at], f[(q + 1) * stride + at]
-            total, difference = _HALF * even * (first + second), _HALF * odd * (first - second)
-            held[q] += total + difference
-            held[q + 1] += total - difference
-            x += _AXES[q, 0] * (first - second)
-            y += _AXES[q, 1] * (first - second)
-            z += _AXES[q, 2] * (first - second)
-        xx, yy, zz = xx + even * x * x, yy + even * y * y, zz + even * z * z
-        xy, xz, yz = xy + even * x * y, xz + even * x * z, yz + even * y * z
-    if law[0] > 0.0:
-        time = np.float32(thinned(stress_size(held), time, law))
-    new_time = _HALF + (time - _HALF) / ratio
-    new = carried(held, (xx, yy, zz, xy, xz, yz), ratio, (time, limit[i], odd_rate), (new_time, limit[i], new_odd_rate))
-    for q in range(19):
-        g[OPPOSITE[q] * new_stride + new_place[i]] = new[q]
+def _split(f: Any, stride: int, at: int, values: Any) -> None:
+    """Write the `_VALUES` of the cell with storage place `at`."""
+    x = y = z = np.float32(0.0)
+    values[0] = f[at]
+    for k in range(9):
+        q = 2 * k + 1
+        first, second = f[q * stride + at], f[(q + 1) * stride + at]
+        values[1 + k], values[_EVEN + k] = _HALF * (first + second), _HALF * (first - second)
+        x += _AXES[q, 0] * (first - second)
+        y += _AXES[q, 1] * (first - second)
+        z += _AXES[q, 2] * (first - second)
+    values[10], values[11], values[12] = x * x, y * y, z * z
+    values[13], values[14], values[15] = x * y, x * z, y * z
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
 def carry(f: Any, stride: int, stencil: Any, into: Any, numbers: Any) -> None:
     """Set populations of a grid by interpolation from those of another (see `collision.carried`).
 
     Parameters
     ----------
     f, stride : populations of the source and distance between two of a cell.
-    stencil : tuple; (n + 1,) int32 first entry of every target cell, (e,) int32 storage place of a source cell, and
-        (e, 2) float32 its weight for the even and for the odd part of the populations.
+    stencil : tuple; (c,) int32 storage places of the source cells read, (n + 1,) int32 first entry of every target
+        cell, (e,) int32 number of a source cell, and (e, 2) float32 its weight for the even and for the odd part of the
+        populations.
     into : tuple; populations and stride of the target, (n,) int32 storage place of every target cell, and (n,) float32
         largest grid Reynolds number there.
     numbers : tuple of float32; ratio of the spacing of the target to that of the source, relaxation time of the source,
         its (4,) Carreau-Yasuda law, and relaxation rates of the odd part on the source and on the target.
     """
-    start, place, weight = stencil  # numba's threads take no nested tuples
+    place, start, cell, weight = stencil
     g, new_stride, new_place, limit = into
     ratio, time, law, odd_rate, new_odd_rate = numbers
+    read = np.zeros((len(place), _VALUES), np.float32)
+    for c in prange(len(place)):
+        _split(f, stride, place[c], read[c])
     for i in prange(len(new_place)):
-        held = np.zeros(19, np.float32)
-        of_cell, of_flow = (g, new_stride, new_place, limit), (ratio, time, law, odd_rate, new_odd_rate)
-        carry_cell(i, f, stride, (start, place, weight), of_cell, of_flow, held)
+        values, held = np.zeros(_VALUES, np.float32), np.zeros(19, np.float32)
+        for e in range(start[i], start[i + 1]):
+            of_cell = read[cell[e]]
+            for k in range(_EVEN):
+                values[k] += weight[e, 0] * of_cell[k]
+            for k in range(_EVEN, _VALUES):
+                values[k] += weight[e, 1] * of_cell[k]
+        held[0] = values[0]
+        for k in range(9):
+            held[2 * k + 1], held[2 * k + 2] = values[1 + k] + values[_EVEN + k], values[1 + k] - values[_EVEN + k]
+        old_time = time
+        if law[0] > 0.0:
+            old_time = np.float32(thinned(stress_size(held), time, law))
+        new_time = _HALF + (old_time - _HALF) / ratio
+        squares = values[10], values[11], values[12], values[13], values[14], values[15]
+        new = carried(held, squares, ratio, (old_time, limit[i], odd_rate), (new_time, limit[i], new_odd_rate))
+        for q in range(19):
+            g[OPPOSITE[q] * new_stride + new_place[i]] = new[q]
 
 
 @njit(cache=True, parallel=True)
