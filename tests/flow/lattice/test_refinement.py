@@ -163,6 +163,36 @@ def test_a_border_across_along_or_oblique_to_the_flow_changes_nothing(
     assert fits[0][0] == pytest.approx(fits[1][0], rel=0.02)
 
 
+def of_narrow(size_mm: float, *, close_up: bool) -> State:
+    """Return the flow after 40 checks in a tube with 12 fine cells across."""
+    settings = FlowSettings(inflow_mL_s=0.6, numerics=Numerics(cell_size_mm=size_mm, close_up=close_up))
+    case = vessel_case(tube(line(24.0), 1.2).vessel, settings, target=Target(ball((0.0, 0.0, 12.0), 0.8), None))
+    engine = LatticeBoltzmann(size_mm)
+    state = engine.init(case, None)
+    while len(state.history) < 40:
+        engine.step(state)
+    return state
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.75])
+def test_a_border_across_a_narrow_artery_takes_no_pressure(slope: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With six coarse cells across: what falls lies between both uniform grids, and the same mass crosses on each."""
+    refine(monkeypatch, lambda at: 1.4 - np.abs(at[:, 2] - 12.0 + slope * at[:, 0]))
+
+    def fall_Pa(state: State) -> float:
+        z, pressure_Pa = state.domain.centers_mm[:, 2], state.snapshots[-1].pressure_Pa
+        before, behind = (pressure_Pa[np.abs(z - at_mm) < 0.21].mean() for at_mm in (1.5, 22.5))
+        return float(before - behind)
+
+    state = of_narrow(0.2, close_up=True)
+    between = state.interface
+    assert between is not None
+    crosses = 0.5 * INFLOW_ML_S / state.scales.flow_mL_s
+    assert np.abs(between.lack).max() < 1e-4 * crosses
+    fine_Pa, coarse_Pa = (fall_Pa(of_narrow(size_mm, close_up=False)) for size_mm in (0.2, 0.4))
+    assert fine_Pa + 0.3 < fall_Pa(state) < coarse_Pa
+
+
 def test_a_screen_resists_the_same_across_a_border(monkeypatch: pytest.MonkeyPatch) -> None:
     """The pressure that an inclined screen takes is that on the uniform fine grid, within 1 %."""
     refine(monkeypatch, lambda at: 1.4 - np.abs(at[:, 2] - 6.0))

@@ -15,6 +15,9 @@ from vstent.flow.lattice.stepping import build, take_pace
 
 def pack(state: State) -> Saved:
     """Return the arrays of a run that cannot be rebuilt from its case and grids."""
+    for level in state.levels:
+        if level.device is not None:
+            level.device.fetch(level)
     saved = {
         "check_s": np.array(state.check_s),
         "pace": state.pace,
@@ -31,8 +34,6 @@ def pack(state: State) -> Saved:
 
 def _of_level(level: State) -> Saved:
     """Return the arrays of one level."""
-    if level.device is not None:
-        level.device.fetch(level)
     between = level.interface
     return {
         "populations": level.populations[: 19 * level.addressing.stride],
@@ -41,6 +42,7 @@ def _of_level(level: State) -> Saved:
         "course": level.built[0].course,
         "refill": level.refill.refill,
         "lack": np.zeros(0) if between is None else between.lack,
+        "push": np.zeros(0) if between is None else between.push,
         **_columns("last", level.snapshots, len(level.domain.cells)),
         **_columns("means", level.blocks, len(level.domain.cells)),
     }
@@ -83,6 +85,7 @@ def unpack(case: FlowCase, cell_size_mm: float, saved: Saved) -> State:
         level.refill.refill[:] = saved[f"{number} refill"]
         if level.interface is not None:
             level.interface.lack[:] = saved[f"{number} lack"]
+            level.interface.push[:] = saved[f"{number} push"]
         level.snapshots = deque(_snapshots(f"{number} last", saved, level.scales), maxlen=kept)
         level.blocks = tuple(_snapshots(f"{number} means", saved, level.scales))
     state.steps, state.since_check = int(saved["steps"]), int(saved["since_check"])

@@ -16,6 +16,12 @@ Interpolation alone does not keep mass. On the border between the third and four
 either grid is therefore compared, and what crossed on the finer grid counts for both: the difference is returned to the
 coarser cells beside the border (Berger and Colella 1989, J. Comput. Phys. 82, 64). The volumetric scheme of Rohde et
 al. 2006 keeps mass as well, but it needs an exchange in each step, and walls that agree on both grids.
+
+The same flow rate has velocities on both grids that differ by some thousandths, because their cells fill a section
+differently. Blood that is set anew in each exchange would have to be accelerated by that between two of them: a border
+across a tube of 8 coarse cells would lose the pressure of 5 cells, one across 10 cells gain that of 1. Momentum normal
+to the border is therefore added to the cells that are set. It is integrated from what remains: on the coarser grid the
+mass that crosses too much, on the finer one the difference of pressure between both grids in the layer between.
 """
 
 from dataclasses import dataclass, replace
@@ -56,6 +62,8 @@ GROUP: Final = 24
 wall, whose faces differ on both grids, disturb the profile."""
 LACK_PART: Final = 0.15
 """Under-relaxation factor with which the mass returned to the coarser level follows what crossed."""
+PUSH_PART: Final = 0.05
+"""Part of the momentum still missing at a border that is added in each exchange."""
 UPSTREAM_DIAMETERS, DOWNSTREAM_DIAMETERS = 5.0, 1.0
 """Extent of the refined part from the sac towards the inlet and the outlets, in mean diameters 4 V / A of the vessel.
 The flow into the sac forms upstream: beside the same spacing everywhere (0.14 mm) the demo's neck inflow is 7 % lower
@@ -63,6 +71,8 @@ with one diameter, 5 % higher with three and 2 % higher with five."""
 SHARES: Final = (1.0, 1 / 3)
 """Part of the allowed time steps of a steady flow that a run makes, without and with finer levels. With these it is
 small, because the run starts from the flow on the coarsest level."""
+CHANGING: Final = ("crossed", "lack", "push")
+"""Arrays of an `Interface` that change during a run."""
 REACH: Final = 1.2
 """Standard deviation in cells of the weights of a fit beside a wall."""
 RIDGE: Final = 1e-3
@@ -85,11 +95,16 @@ class Stencil:
     """(n,) storage places of the target cells."""
     limit: NDArray[np.float32]
     """(n,) largest grid Reynolds number there (see `setup.thickest`)."""
+    group: Ints
+    """(n,) group of each of them."""
+    share: NDArray[np.float32]
+    """(n, 3) what it gets of the momentum added to its group normal to the border, in proportion to the wall
+    distance."""
 
 
 @dataclass(frozen=True, eq=False)
 class Interface:
-    """Coupling between a grid and the next finer one; `crossed` and `lack` change in place during a run."""
+    """Coupling of a grid and the next finer one; `crossed`, `lack` and `push` change in place during a run."""
 
     down: Stencil
     """From the coarser to the finer grid."""
@@ -107,12 +122,20 @@ class Interface:
     """(g,) mass that crossed on the finer grid since the last exchange and not on the coarser one, in coarse cells."""
     lack: Floats
     """(g,) mass taken from the cells beside the border before every pair of steps of the coarser grid."""
+    between: tuple[Ints, Ints, Ints]
+    """Cells of both grids in the layer that neither sets (see `exchange.add_jump`)."""
+    push: Floats
+    """(2, g) momentum into the finer grid that is added to the cells set on the finer and on the coarser grid."""
     is_trusted: Bools
     """(n,) whether each cell of the finer grid lies inside the border."""
 
     def anew(self) -> "Interface":
         """Return the same coupling for another run."""
-        return replace(self, crossed=np.zeros_like(self.crossed), lack=np.zeros_like(self.lack))
+        return replace(self, **{name: np.zeros_like(getattr(self, name)) for name in CHANGING})
+
+    def twin(self) -> "Interface":
+        """Return the same coupling in its present state, for a run that goes its own way."""
+        return replace(self, **{name: getattr(self, name).copy() for name in CHANGING})
 
 
 def require_sac(case: FlowCase) -> Surface:
@@ -200,38 +223,60 @@ def refined(case: FlowCase, coarse: Grid, wires: Surface | None) -> tuple[Grid, 
 def _coupled(coarse: Grid, fine: Grid, layer_of_wide: Ints, layer_of_fine: Ints) -> tuple[Grid, Grid, Interface]:
     """Return two grids with their border, and their coupling, from the layer of every cell (see `window`)."""
     wide = coarse.domain
-    down = stencil(coarse, fine, np.flatnonzero(np.isin(layer_of_fine, CARRIED_DOWN)))
-    up = stencil(fine, coarse, np.flatnonzero(np.isin(layer_of_wide, CARRIED_UP)))
     sides = layer_of_wide >= OWN_LAYER, layer_of_fine >= OWN_LAYER
     links = [_crossing(grid, is_own) for grid, is_own in zip((coarse, fine), sides, strict=True)]
     beside = np.unique(links[0][1])
     group = _pieces(wide.cells[beside])
-    groups = int(group.max(initial=-1)) + 1
-    depth_mm = wide.depth_mm[beside]
-    nearest = cKDTree(wide.centers_mm[beside]) if groups else None
+    groups = int(group.max(initial=0)) + 1
+    nearest = cKDTree(wide.centers_mm[beside]) if len(beside) else None
+
+    def group_at(places_mm: Floats) -> Ints:
+        return group[nearest.query(places_mm)[1]] if nearest else np.zeros(len(places_mm), np.int32)
+
     grids, border = [], []
     for grid, is_own, (inside, outside, crossed) in zip((coarse, fine), sides, links, strict=True):
         # Links that cross between the same two points share a group: along the border they carry mass to and fro.
-        middle_mm = 0.5 * (grid.domain.centers_mm[inside] + grid.domain.centers_mm[outside])
-        of_link = group[nearest.query(middle_mm)[1]] if nearest else inside
+        of_link = group_at(0.5 * (grid.domain.centers_mm[inside] + grid.domain.centers_mm[outside]))
         order = np.argsort(of_link, kind="stable")
         start = np.searchsorted(of_link[order], np.arange(groups + 1)).astype(np.int32)
         first = behind(grid.addressing) + 2 * sum(len(one.cell) for one in grid.crossings)
         border.append(Crossings(inside[order], crossed[order], start, first))
         side = is_own + 2 * (0 if grid.side is None else grid.side)
         grids.append(replace(grid, crossings=(*grid.crossings, border[-1]), side=side.astype(np.int32)))
+        ahead_mm = grid.domain.centers_mm[inside] - grid.domain.centers_mm[outside]
+    # Of a closed piece the directions cancel: it has no flow rate to keep.
+    size_mm = np.bincount(of_link, np.linalg.norm(ahead_mm, axis=1), groups)
+    total_mm = np.stack([np.bincount(of_link, along_mm, groups) for along_mm in ahead_mm.T], axis=1)
+    normal = total_mm / np.maximum(size_mm, 1e-300)[:, None]
+
+    def carried(read: Grid, written: Grid, target: Ints) -> Stencil:
+        of_cell = group_at(written.domain.centers_mm[target])
+        share = _shares(of_cell, written.domain.depth_mm[target], groups)[:, None] * normal[of_cell]
+        return stencil(read, written, target, of_cell, share)
+
+    corner = fine.domain.cell_size_mm * (np.indices((WIDTH,) * 3).reshape(3, -1).T - 0.5)
+    middle: Ints = np.flatnonzero(layer_of_wide == OWN_LAYER - 1)
+    finer = np.stack([fine.domain.cells_at(wide.centers_mm[middle] + offset) for offset in corner], axis=1)
+    middle, finer = middle[(finer >= 0).all(axis=1)], finer[(finer >= 0).all(axis=1)]
     coupling = Interface(
-        down,
-        up,
+        carried(coarse, fine, np.flatnonzero(np.isin(layer_of_fine, CARRIED_DOWN))),
+        carried(fine, coarse, np.flatnonzero(np.isin(layer_of_wide, CARRIED_UP))),
         (border[0], border[1]),
         coarse.addressing.place[beside],
         group,
-        depth_mm / np.bincount(group, depth_mm, groups)[group],
+        _shares(group, wide.depth_mm[beside], groups),
         np.zeros(groups),
         np.zeros(groups),
+        (coarse.addressing.place[middle], fine.addressing.place[finer], group_at(wide.centers_mm[middle])),
+        np.zeros((2, groups)),
         sides[1],
     )
     return grids[0], grids[1], coupling
+
+
+def _shares(group: Ints, size: Floats, groups: int) -> Floats:
+    """Return the part (c,) of each cell in the total size of its group."""
+    return size / np.bincount(group, size, groups)[group]
 
 
 def _pieces(cells: Ints) -> Ints:
@@ -267,8 +312,8 @@ def _crossing(grid: Grid, is_own: Bools) -> tuple[Ints, Ints, Ints]:
     return inside, outside, np.column_stack([enters, leaves]).astype(np.int32)
 
 
-def stencil(read: Grid, written: Grid, target: Ints) -> Stencil:
-    """Return the interpolation from cells of one grid to cells `target` (n,) of another.
+def stencil(read: Grid, written: Grid, target: Ints, group: Ints, share: Floats) -> Stencil:
+    """Return the interpolation from cells of one grid to cells `target` (n,) of another (see `Stencil`).
 
     Those with no cell of the first grid near them are left out.
     """
@@ -295,12 +340,20 @@ def stencil(read: Grid, written: Grid, target: Ints) -> Stencil:
         even[beside], odd[beside] = _beside_wall(source, other, target[beside], cell[beside], away)
     is_used = (cell >= 0) & (even != 0)
     is_near = is_used.any(axis=1)
-    is_used, cell, even, odd, target = (values[is_near] for values in (is_used, cell, even, odd, target))
+    is_used, cell, even, odd = (values[is_near] for values in (is_used, cell, even, odd))
+    target, group, share = (values[is_near] for values in (target, group, share))
     start = np.r_[0, np.cumsum(is_used.sum(axis=1))].astype(np.int32)
     weight = np.stack([even[is_used], odd[is_used]], axis=1).astype(np.float32)
     place, number = np.unique(read.addressing.place[cell[is_used]], return_inverse=True)
     return Stencil(
-        place, start, number.astype(np.int32), weight, written.addressing.place[target], written.limit[target]
+        place,
+        start,
+        number.astype(np.int32),
+        weight,
+        written.addressing.place[target],
+        written.limit[target],
+        group,
+        share.astype(np.float32),
     )
 
 
