@@ -11,7 +11,7 @@ from vstent.deployment.struts import thickness_mm
 from vstent.errors import FlowError
 from vstent.flow import sampling
 from vstent.flow.case import Cells, FlowCase
-from vstent.flow.settings import LATTICE, Blood
+from vstent.flow.settings import Blood
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Opening, Vessel
 from vstent.kernels import triangles, voxels
@@ -175,25 +175,19 @@ def default_cell_size_mm(case: FlowCase) -> float:
     """Return the grid spacing of a case: as set, else from `cells_per_diameter` and `cell_budget`.
 
     The cells are counted across the mean diameter 4 V / A of the vessel, or across its inlet where that is narrower,
-    because a large sac increases the mean. Wires to be resolved on a grid too coarse for them are refused.
+    because a large sac increases the mean.
     """
     numerics, size_mm = case.numerics, case.numerics.cell_size_mm
     if size_mm is None:
         across_mm = min(mean_diameter_mm(case.vessel), case.vessel.inlet.diameter_mm)
         by_diameter = across_mm / numerics.cells_per_diameter
         size_mm = max(by_diameter, (case.vessel.closed.volume_mm3 / numerics.cell_budget) ** (1 / 3))
-    if numerics.engine == LATTICE and numerics.resolve_wires and case.wires and wires_of(case, size_mm) is None:
-        thick_mm = thickness_mm(case.wires)
-        raise CoarseGridError(
-            f"a grid spacing of {size_mm:.3g} mm does not resolve wires {thick_mm:.3g} mm thick: set "
-            f"{thick_mm / ACROSS:.2g} mm (--grid-spacing), or keep the screen model (without --resolve-wires)"
-        )
     return size_mm
 
 
 def wires_of(case: FlowCase, cell_size_mm: float) -> Surface | None:
     """Return the wires that are walls on a grid of this spacing; None where the media stand for them."""
-    if not case.numerics.resolve_wires or case.wires is None:
+    if case.numerics.wires != "resolved" or case.wires is None:
         return None
     return case.wires if thickness_mm(case.wires) > LEAST_ACROSS * cell_size_mm else None
 

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 Outlets = Literal["zero_pressure", "murray", "split", "resistance", "windkessel"]
 """Condition at the outlets."""
+Wires = Literal["auto", "screen", "resolved"]
+"""How a flow takes the wires over necks and branches."""
 RESISTING: Final = ("resistance", "windkessel")
 """Conditions with which the flow out follows the pressure."""
 Elements = tuple[float, float, float]
@@ -129,11 +131,17 @@ class Numerics:
         False, "refine-sac", "use the grid spacing only in and near the sac, and twice it elsewhere", flag
     )
     """Whether to use this grid spacing only in and near the sac, and twice it elsewhere (see `lattice.levels`)."""
-    resolve_wires: bool = setting(
-        False, "resolve-wires", "take wires over necks and branches as walls of the flow grid, not as a screen", flag
+    wires: Wires = setting(
+        "screen",
+        "wires",
+        "wires over necks and branches: a flow resistance (screen), walls on finer grids around them (resolved), or "
+        "walls where that takes less than ten minutes (auto)",
+        str,
+        choices=get_args(Wires),
+        metavar="WORD",
     )
-    """Whether the embedded engine takes the wires over necks and ostia as walls instead of as media. Coarser grids,
-    on which a flow only begins or which surround a refined region, have the media where wires are too thin for them."""
+    """How the embedded engine takes the wires over necks and ostia: as media, or as walls on as many finer levels as
+    they need for four cells across. Coarser levels have the media where wires are too thin for them."""
     cells_per_diameter: float = 29.0
     """Number of cells across the mean (hydraulic) diameter 4 V / A of the vessel, where no grid spacing is given."""
     cell_budget: float = 480_000.0

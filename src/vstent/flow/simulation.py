@@ -21,12 +21,18 @@ from vstent.flow.domain import MIN_CELLS, CoarseGridError, default_cell_size_mm
 from vstent.flow.engines import AbstractEngine, DivergenceError, Progress, Saved, run
 from vstent.flow.lattice.gpu import require_gpu
 from vstent.flow.measured import MeasuredProfile
+from vstent.flow.memory import free_memory_bytes
 from vstent.flow.problem import flow_case
-from vstent.flow.settings import LATTICE, OPENFOAM, RESISTING, FlowSettings, Numerics
+from vstent.flow.settings import LATTICE, OPENFOAM, RESISTING, FlowSettings, Numerics, Wires
 from vstent.geometry.vessel import Anatomy
 
+SCREEN_SHARE = 0.2
+"""Assumed share of the run time of the flow with a screen, from which one with resolved wires begins."""
 COARSE_SHARE = 0.12
 """Assumed share of the run time of each coarse run, for the progress."""
+
+QUICK_S = 600.0
+"""Foretold run time up to which wires are resolved where that is left to the program."""
 
 CALMER_TRIES = 3
 """Maximum number of retries of a diverged run, each with a shorter time step."""
@@ -112,8 +118,28 @@ def simulate_case(
     """
     if case.media or case.solids:
         case = _resisted(case, start)
+    case, remark = _decided(case)
     with nullcontext(folder) if folder is not None else TemporaryDirectory(prefix="vstent-") as own:
-        return _Runs(_engine_of(case), Path(own), progress, checkpoint, similar).answer(case, start)
+        field = _Runs(_engine_of(case), Path(own), progress, checkpoint, similar).answer(case, start)
+    return replace(field, advice=field.advice + remark) if remark else field
+
+
+def _with_wires(case: FlowCase, wires: Wires) -> FlowCase:
+    """Return a case that takes its wires in this way."""
+    return replace(case, numerics=replace(case.numerics, wires=wires))
+
+
+def _decided(case: FlowCase) -> tuple[FlowCase, str]:
+    """Return a case with its wires as walls or as a screen where that is open, and a sentence with the reason."""
+    from vstent.flow.lattice.cost import estimate
+
+    if case.numerics.wires != "auto" or case.numerics.engine != LATTICE or case.wires is None:
+        return (_with_wires(case, "screen") if case.numerics.wires == "auto" else case), ""
+    cost = estimate(_with_wires(case, "resolved"))
+    how = f"resolving them would take {cost.seconds / 60:.2g} min and {cost.memory_bytes / 1e9:.2g} GB."
+    if case.numerics.device_gpu or cost.seconds > QUICK_S or cost.memory_bytes > free_memory_bytes():
+        return _with_wires(case, "screen"), f" The wires are a screen: {how}"
+    return _with_wires(case, "resolved"), ""
 
 
 def _resisted(case: FlowCase, bare: FlowField | None) -> FlowCase:
@@ -129,7 +155,8 @@ def _resisted(case: FlowCase, bare: FlowField | None) -> FlowCase:
 
 def foretell_cost(case: FlowCase) -> str:
     """Return a sentence on the expected run time and memory of a flow; one that does not fit is refused."""
-    return _engine_of(case)(default_cell_size_mm(case)).cost(case)
+    case, remark = _decided(case)
+    return _engine_of(case)(default_cell_size_mm(case)).cost(case) + remark
 
 
 def memory_bytes(case: FlowCase) -> float | None:
@@ -158,10 +185,10 @@ def engine_class(numerics: Numerics, *, is_pulsatile: bool) -> type[AbstractEngi
             f"the engine {numerics.engine} does not support a finer grid in the sac alone: switch it off "
             f"(--refine-sac), or choose the engine {LATTICE}"
         )
-    if numerics.close_up and numerics.device_gpu:
+    if (numerics.close_up or numerics.wires == "resolved") and numerics.device_gpu:
         raise InputError(
-            "a finer grid in the sac alone is not computed on a GPU: leave out --refine-sac, or compute on the CPU "
-            "(without --gpu)"
+            "finer grids in the sac and around wires are not computed on a GPU: leave out --refine-sac and --wires "
+            "resolved, or compute on the CPU (without --gpu)"
         )
     if numerics.device_gpu and not engine.runs_on_gpu:
         raise InputError(
@@ -216,6 +243,10 @@ class _Runs:
         Every run is begun only where a finer one needs its result; a finer one that is resumed does not. If the flow
         without a device is known, a coarse grid only provides the change due to the screen (see `_guess`).
         """
+        if case.numerics.wires == "resolved" and case.wires is not None and self.engine.has_levels:
+            as_screen = replace(self, progress=None if self.progress is None else self._part(0.0, SCREEN_SHARE))
+            begun = partial(as_screen.answer, _with_wires(case, "screen"), start)
+            return self._run("resolved", case, default_cell_size_mm(case), begun, (SCREEN_SHARE, 1.0))
         sizes_mm, coarsening = [default_cell_size_mm(case)], self.engine.coarsening
         whole = replace(case, numerics=replace(case.numerics, close_up=False))  # a guess has one level
         if coarsening is not None and self.similar is None and (start is None or case.media):

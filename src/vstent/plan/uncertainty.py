@@ -200,7 +200,7 @@ def vary_seeds(
             return found
         shapes, porosity = sac_surfaces(anatomy), 1.0 - found["packing_density_fraction"]
         after = indices(simulate_case(flow_case(anatomy, (placed.stent,), wanted), start=bare(wanted)), *shapes)
-        after = after if wanted.numerics.resolve_wires else between_coils(after, porosity)
+        after = after if wanted.numerics.wires == "resolved" else between_coils(after, porosity)
         changes = ratios(indices(bare(wanted), *shapes), after)
         return found | {name: changes[name] for name in FLOW_RESULTS if name in changes}
 

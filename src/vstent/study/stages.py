@@ -530,7 +530,7 @@ def measure_treatment(anatomy: Anatomy, deployed: Mapping[str, Deployment]) -> d
 
 def _porosity(deployed: Mapping[str, Deployment], flow: FlowSettings | None) -> float:
     """Return blood's part of a sac in which coils are a porous region in the flow; 1 where there are none."""
-    if flow is None or flow.numerics.resolve_wires:
+    if flow is None or flow.numerics.wires == "resolved":
         return 1.0
     return 1.0 - sum(one.stent.density_fraction for one in deployed.values() if isinstance(one.stent, Coils))
 

@@ -13,14 +13,13 @@ from vstent.anatomy.trim import trim
 from vstent.deployment.struts import united
 from vstent.flow import domain
 from vstent.flow.case import FlowCase
-from vstent.flow.domain import CoarseGridError
 from vstent.flow.lattice import stepping
+from vstent.flow.lattice.cost import estimate
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.reading import exchanged, force_N
 from vstent.flow.lattice.state import State
 from vstent.flow.problem import flow_case
 from vstent.flow.settings import FlowSettings, Numerics
-from vstent.flow.simulation import simulate_case
 from vstent.geometry.vessel import Vessel
 
 CELL_MM = 0.075
@@ -40,7 +39,7 @@ def resolved() -> FlowCase:
     anatomy = restore(whole)
     design = replace(vstent.find_design("enterprise"), strut_width_um=220.0, strut_thickness_um=220.0)
     stent = vstent.deploy(design, anatomy).stent
-    numerics = Numerics(cell_size_mm=CELL_MM, resolve_wires=True)
+    numerics = Numerics(cell_size_mm=CELL_MM, wires="resolved")
     case = flow_case(anatomy, (stent,), FlowSettings(inflow_mL_s=1.0, numerics=numerics))
     return replace(case, vessel=trim(whole, upstream_mm=3.0, downstream_mm=3.0))
 
@@ -88,13 +87,16 @@ def test_blood_drags_wires_along(resolved: FlowCase, flow: State) -> None:
     assert force @ along > 0
 
 
-def test_a_grid_too_coarse_for_the_wires_is_refused_and_a_first_guess_has_the_screen(resolved: FlowCase) -> None:
-    coarse = replace(resolved, numerics=replace(resolved.numerics, cell_size_mm=0.15))
-    with pytest.raises(
-        CoarseGridError, match=r"does not resolve wires 0\.206 mm thick: set 0\.051 mm \(--grid-spacing\)"
-    ):
-        simulate_case(coarse)
-    assert domain.wires_of(resolved, 2 * CELL_MM) is None
-    guess = LatticeBoltzmann(2 * CELL_MM).init(resolved, None)
-    assert len(guess.screen.cell) > 0
-    assert not len(guess.links.of_wires)
+def test_wires_too_thin_for_the_grid_are_walls_on_a_finer_level(resolved: FlowCase) -> None:
+    """The coarser level has the screen; both agree on the flow through it and on the mass at their border."""
+    case = replace(resolved, numerics=replace(resolved.numerics, cell_size_mm=2 * CELL_MM))
+    assert domain.wires_of(case, 2 * CELL_MM) is None
+    state = LatticeBoltzmann(2 * CELL_MM).init(case, None)
+    coarse, fine = state.levels
+    assert len(coarse.screen.cell) > 0
+    assert not len(coarse.links.of_wires)
+    assert not len(fine.screen.cell)
+    assert len(fine.links.of_wires) > 1000
+    made, foretold = sum(len(level.domain.cells) for level in state.levels), estimate(case).cells
+    assert made == pytest.approx(foretold, rel=0.25)
+    assert state.kept == (state,)

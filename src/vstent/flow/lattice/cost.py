@@ -14,7 +14,7 @@ from vstent.flow.domain import default_cell_size_mm, extended_volume_mm3
 from vstent.flow.lattice.gpu import free_gpu_bytes
 from vstent.flow.lattice.kernels import d3q19, lanes
 from vstent.flow.lattice.kernels.warm import keep_flow
-from vstent.flow.lattice.levels import SHARES, WIDTH, count, volume_mm3
+from vstent.flow.lattice.levels import WIDTH, sizes_mm, volume_mm3, volume_near_wires_mm3
 from vstent.flow.lattice.pace import pace
 from vstent.flow.memory import free_memory_bytes
 
@@ -74,16 +74,18 @@ def estimate(case: FlowCase) -> Cost:
     cell_size_mm = default_cell_size_mm(case)
     cells, memory_bytes = _size(case, cell_size_mm)
     steps = _steps(case, cell_size_mm)
-    updates = sum(of_level * steps / WIDTH**depth for depth, of_level in enumerate(_cells(case, cell_size_mm)))
+    updates = sum(of_level * steps / WIDTH**depth for depth, of_level in enumerate(_cells(case, cell_size_mm)[::-1]))
     seconds = updates / block_rate(on_gpu=case.numerics.device_gpu) * WHOLE_OVER_BLOCK
     return Cost(cell_size_mm, round(cells), round(memory_bytes), steps, seconds)
 
 
 def _cells(case: FlowCase, cell_size_mm: float) -> list[float]:
-    """Return the number of cells of every level, from the finest on."""
-    whole = extended_volume_mm3(case.vessel)
-    volumes_mm3 = [whole] if count(case) == 1 else [volume_mm3(case, WIDTH * cell_size_mm), whole]
-    return [volume / (WIDTH**depth * cell_size_mm) ** 3 for depth, volume in enumerate(volumes_mm3)]
+    """Return the number of cells of every level, coarse to fine."""
+    sizes, volumes_mm3 = sizes_mm(case, cell_size_mm), [extended_volume_mm3(case.vessel)]
+    if case.numerics.close_up:
+        volumes_mm3.append(volume_mm3(case, sizes[0]))
+    volumes_mm3 += [volume_near_wires_mm3(case, size_mm) for size_mm in sizes[len(volumes_mm3) - 1 : -1]]
+    return [volume / size_mm**3 for volume, size_mm in zip(volumes_mm3, sizes, strict=True)]
 
 
 def refuse_too_large(case: FlowCase, free_bytes: float | None = None, gpu_bytes: float | None = None) -> None:
@@ -142,10 +144,18 @@ def _size(case: FlowCase, cell_size_mm: float) -> tuple[float, float]:
 
 def _steps(case: FlowCase, cell_size_mm: float) -> int:
     """Return the maximum number of time steps on the finest level."""
+    sizes, kept = sizes_mm(case, cell_size_mm), 1 + case.numerics.close_up
     if case.waveform is None:
-        return int(SHARES[count(case) > 1] * case.numerics.max_steps)
-    finer = WIDTH ** (count(case) - 1)
-    return finer * int(pace(case, finer * cell_size_mm, None).sum()) * case.numerics.max_cycles
+        return int(part_of_steps(len(sizes), kept) * case.numerics.max_steps) * WIDTH ** (len(sizes) - kept)
+    return WIDTH ** (len(sizes) - 1) * int(pace(case, sizes[0], None).sum()) * case.numerics.max_cycles
+
+
+def part_of_steps(levels: int, kept: int) -> float:
+    """Return the part of the allowed time steps of a steady flow that a run with levels makes, of which some are kept.
+
+    It is small where it begins from a flow on the coarsest level, or from the flow with a screen.
+    """
+    return 1.0 if levels == 1 else 1 / 3 if levels == kept else 1 / 16
 
 
 @cache

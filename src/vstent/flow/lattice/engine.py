@@ -9,10 +9,10 @@ from vstent.flow.case import PHASES, FlowCase, FlowField, Phase
 from vstent.flow.engines import AbstractEngine, Outcome, Saved
 from vstent.flow.lattice import stepping
 from vstent.flow.lattice.checkpoint import pack, unpack
-from vstent.flow.lattice.cost import estimate, memory_bytes, refuse_too_large
+from vstent.flow.lattice.cost import estimate, memory_bytes, part_of_steps, refuse_too_large
 from vstent.flow.lattice.gpu import require_gpu
 from vstent.flow.lattice.kernels import d3q19
-from vstent.flow.lattice.levels import SHARES, WIDTH, count
+from vstent.flow.lattice.levels import WIDTH, sizes_mm
 from vstent.flow.lattice.pace import longest_step_s, pace, peak_speed_m_s
 from vstent.flow.lattice.reading import field_of, joined, read, read_moving
 from vstent.flow.lattice.settling import CHECKS_APART, SHARE_OF_FIELD, Mean, field_left, mean_of, with_check
@@ -68,7 +68,7 @@ class AbstractLattice(AbstractEngine[State]):
 
     def coarsest_mm(self, case: FlowCase) -> float:
         """Return the grid spacing of the coarsest level."""
-        return self.cell_size_mm * WIDTH ** (count(case) - 1)
+        return sizes_mm(case, self.cell_size_mm)[0]
 
     def prepare(self, case: FlowCase) -> None:
         """Build the grids."""
@@ -100,7 +100,7 @@ class LatticeBoltzmann(AbstractLattice):
         """Set up a run whose fastest blood moves `lattice_speed` cells a step."""
         step_s = longest_step_s(case, self.coarsest_mm(case), peak_speed_m_s(case, start))
         check_s = CHECK_DIAMETERS * case.vessel.inlet.diameter_mm * M_PER_MM / float(case.inlet_speeds_m_s[0])
-        most = case.numerics.max_steps / WIDTH ** (count(case) - 1)
+        most = case.numerics.max_steps / WIDTH**case.numerics.close_up
         steps = 2 * max(1, round(0.5 * min(check_s / step_s, most / LEAST_CHECKS)))
         kept = 2 * CHECKS_APART + 1
         return stepping.build(case, self.cell_size_mm, steps * step_s, np.array([steps]), start=start, kept=kept)
@@ -109,7 +109,7 @@ class LatticeBoltzmann(AbstractLattice):
         """Advance the run towards its next check and, at a check, update the block means."""
         super().step(state)
         if not state.since_check:
-            for level in state.levels:
+            for level in state.kept:
                 level.blocks = with_check(level.blocks, level.snapshots[-1])
         return state
 
@@ -120,24 +120,24 @@ class LatticeBoltzmann(AbstractLattice):
         """
         if state.since_check:
             return None
-        if any(level.snapshots[-1].is_lost for level in state.levels):
+        if any(level.snapshots[-1].is_lost for level in state.kept):
             return float("nan")
         return min(_left(state), _mean(state).left)
 
     def max_checks(self, state: State) -> int:
         """Return the maximum number of checks within the limit of time steps."""
-        share = SHARES[state.finer is not None]
-        return max(4, int(share * state.case.numerics.max_steps // state.finest.steps_per_check))
+        steps = part_of_steps(len(state.levels), len(state.kept)) * state.case.numerics.max_steps
+        return max(4, int(steps // state.main.steps_per_check))
 
     def result(self, state: State, outcome: Outcome) -> FlowField:
         """Return the last check of a converged flow, or the time average of an unsteady one."""
         left = _left(state)
         if left < state.case.numerics.tolerance:
-            flows = [read(level, [level.snapshots[-1]]) for level in state.levels]
+            flows = [read(level, [level.snapshots[-1]]) for level in state.kept]
             return field_of(state, flows, outcome, left, "The flow has converged.")
         mean = _mean(state)
         uncertain, advice = _of_mean(state, mean, is_converged=outcome.is_converged)
-        flows = [read_moving(level, level.blocks[-mean.blocks :]) for level in state.levels]
+        flows = [read_moving(level, level.blocks[-mean.blocks :]) for level in state.kept]
         return field_of(state, flows, outcome, uncertain, advice)
 
 
@@ -157,7 +157,7 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
         """
         if state.since_check:
             return None
-        if any(level.snapshots[-1].is_lost for level in state.levels):
+        if any(level.snapshots[-1].is_lost for level in state.kept):
             return float("nan")
         change = cycle_change(np.array(state.history))
         return max(change, _outflow_error(state)) if state.case.resistances and np.isfinite(change) else change
@@ -168,7 +168,7 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
 
     def result(self, state: State, outcome: Outcome) -> FlowField:
         """Return the mean flow of the last cycle, with its phases."""
-        levels, phases = state.levels, []
+        levels, phases = state.kept, []
         for k in range(len(state.snapshots)):
             flows = [read(level, [level.snapshots[k]]) for level in levels]
             flow = joined(state, flows)
@@ -186,7 +186,7 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
 
 def _left(state: State) -> float:
     """Return the estimated relative distance of the run from convergence."""
-    fields = [one.velocity[state.finest.probe.cells] for one in state.finest.snapshots]
+    fields = [one.velocity[state.main.probe.cells] for one in state.main.snapshots]
     links, enters = state.links, state.links.is_inflow
     wanted = (links.wanted * links.openings[:, d3q19.AREA])[enters]
     # Not zero while sound waves leave through the openings.
@@ -211,7 +211,7 @@ def _outflow_error(state: State) -> float:
 
 def _mean(state: State) -> Mean:
     """Return the best time average of the run so far."""
-    return mean_of(state.finest.blocks, np.array(state.history), state.finest.probe.cells)
+    return mean_of(state.main.blocks, np.array(state.history), state.main.probe.cells)
 
 
 def _of_mean(state: State, mean: Mean, *, is_converged: bool) -> tuple[float, str]:
@@ -241,7 +241,7 @@ def _of_mean(state: State, mean: Mean, *, is_converged: bool) -> tuple[float, st
 
 def trouble(state: State) -> str:
     """Return one sentence: when the run diverged, where the flow was fastest, the likely cause and what to do."""
-    lost = next((level for level in state.levels if level.snapshots and level.snapshots[-1].is_lost), state.finest)
+    lost = next((level for level in state.kept if level.snapshots and level.snapshots[-1].is_lost), state.main)
     good = [one for one in lost.snapshots if not one.is_lost]
     when_ms = 1e3 * state.time_s
     if not good:

@@ -25,7 +25,7 @@ too much, on the finer one the difference of pressure between both grids in the 
 """
 
 from dataclasses import dataclass, replace
-from math import pi, sqrt
+from math import ceil, log2, pi, sqrt
 from typing import Final
 
 import numpy as np
@@ -35,6 +35,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
+from vstent.deployment.struts import thickness_mm
 from vstent.errors import FlowError
 from vstent.flow import domain as domains
 from vstent.flow.case import FlowCase
@@ -42,6 +43,7 @@ from vstent.flow.domain import Domain, Window
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.setup import Crossings, Grid, address, behind, thickest
 from vstent.geometry.surface import Surface
+from vstent.kernels import voxels
 from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.kernels.directions import VELOCITIES
 
@@ -68,11 +70,14 @@ UPSTREAM_DIAMETERS, DOWNSTREAM_DIAMETERS = 5.0, 1.0
 """Extent of the refined part from the sac towards the inlet and the outlets, in mean diameters 4 V / A of the vessel.
 The flow into the sac forms upstream: beside the same spacing everywhere (0.14 mm) the demo's neck inflow is 9 % lower
 with one diameter, 1 % lower with two, 3 % higher with three and 1 % higher with five."""
-SHARES: Final = (1.0, 1 / 3)
-"""Part of the allowed time steps of a steady flow that a run makes, without and with finer levels. With these it is
-small, because the run starts from the flow on the coarsest level."""
+BESIDE_NECK: Final = 6.0
+"""Distance from the sac up to which wires are walls on finer levels, in thicknesses; beyond they are a screen."""
+MARGIN_CELLS: Final = 7.0
+"""Distance in cells by which a refined part around wires exceeds the next finer one, the diagonal of `RIM` included."""
 CHANGING: Final = ("crossed", "lack", "push")
 """Arrays of an `Interface` that change during a run."""
+CHUNK: Final = 50_000
+"""Number of cells whose stencils are computed at once."""
 REACH: Final = 1.2
 """Standard deviation in cells of the weights of a fit beside a wall."""
 RIDGE: Final = 1e-3
@@ -128,6 +133,8 @@ class Interface:
     """(2, g) momentum into the finer grid that is added to the cells set on the finer and on the coarser grid."""
     is_trusted: Bools
     """(n,) whether each cell of the finer grid lies inside the border."""
+    inner: tuple[Ints, Ints]
+    """(i,) cells of the finer grid inside the border, and those of the coarser grid in which they lie."""
 
     def anew(self) -> "Interface":
         """Return the same coupling for another run."""
@@ -168,6 +175,44 @@ def near_sac(case: FlowCase, grid: Domain) -> Bools:
     return is_near | (is_upstream & (distance_mm <= UPSTREAM_DIAMETERS * diameter_mm))
 
 
+def _reach_mm(case: FlowCase, size_mm: float) -> float:
+    """Return the distance from wires to which a grid with this spacing is refined: their thickness at the finest."""
+    assert case.wires is not None
+    thick_mm = thickness_mm(case.wires)
+    return thick_mm + MARGIN_CELLS * max(0.0, size_mm - WIDTH * thick_mm / domains.ACROSS)
+
+
+def _walls(case: FlowCase) -> Surface:
+    """Return the part of the wires that finer levels take as walls: all in the sac and near its neck."""
+    assert case.wires is not None
+    if case.sac is None:
+        return case.wires
+    is_near = case.sac.signed_distance(case.wires.corners_mm.mean(axis=1)) < BESIDE_NECK * thickness_mm(case.wires)
+    return Surface(case.wires.vertices_mm, case.wires.faces[is_near])
+
+
+def near_wires(case: FlowCase, grid: Domain) -> Bools:
+    """Return whether each cell (n,) lies near wires that finer levels take as walls."""
+    wires, reach_mm = _walls(case), _reach_mm(case, grid.cell_size_mm)
+    low, high = wires.vertices_mm.min(axis=0) - reach_mm, wires.vertices_mm.max(axis=0) + reach_mm
+    result = ((grid.centers_mm > low) & (grid.centers_mm < high)).all(axis=1)
+    result[result] = wires.closest(grid.centers_mm[result])[1] < reach_mm
+    return result
+
+
+def volume_near_wires_mm3(case: FlowCase, size_mm: float) -> float:
+    """Estimate the volume of what is refined around wires on a grid with this spacing."""
+    reach_mm = _reach_mm(case, size_mm) + 1.2 * RIM * size_mm
+    step_mm, corners_mm = reach_mm / 4, _walls(case).corners_mm
+    low_mm = corners_mm.min(axis=(0, 1)) - reach_mm - 2 * step_mm
+    at = np.rint((corners_mm.mean(axis=1) - low_mm) / step_mm).astype(int)
+    is_blood = np.ones(at.max(axis=0) + 7, dtype=bool)
+    outside = voxels.fill((case.vessel.closed.corners_mm - low_mm) / step_mm, is_blood.shape)
+    is_blood[tuple(at.T)] = False
+    near = ndimage.distance_transform_edt(is_blood) * step_mm < reach_mm
+    return float((near & outside).sum()) * step_mm**3
+
+
 def volume_mm3(case: FlowCase, coarse_mm: float) -> float:
     """Estimate the volume of the refined part of a case, the sac and a piece of the artery."""
     sac, diameter_mm = require_sac(case), domains.mean_diameter_mm(case.vessel)
@@ -201,16 +246,33 @@ def window(grid: Domain, is_wanted: Bools) -> tuple[Window, Ints]:
     return Window(grid.origin_mm + low * grid.cell_size_mm - 0.5 * (grid.cell_size_mm - size_mm), fine), layer
 
 
-def count(case: FlowCase) -> int:
-    """Return the number of levels of a case; raise a `FlowError` where there is no sac to refine."""
-    return 2 if case.numerics.close_up and require_sac(case) else 1
+def sizes_mm(case: FlowCase, cell_size_mm: float) -> tuple[float, ...]:
+    """Return the grid spacings of the levels of a case, coarse to fine, where `cell_size_mm` is wanted in the sac.
+
+    With `close_up` one is coarser; those around wires are finer. Where there is no sac a `FlowError` is raised.
+    """
+    coarser = int(case.numerics.close_up and require_sac(case) is not None)
+    finer = 0
+    if case.numerics.wires == "resolved" and case.wires is not None:
+        finer = max(0, ceil(log2(domains.ACROSS * cell_size_mm / thickness_mm(case.wires)) - 0.55))
+    return tuple(cell_size_mm / WIDTH**k for k in range(-coarser, finer + 1))
 
 
-def refined(case: FlowCase, coarse: Grid, wires: Surface | None) -> tuple[Grid, Grid, Interface]:
-    """Return a grid, the next finer one in it with `wires` as walls, and the coupling of both."""
+def refined(case: FlowCase, coarse: Grid, finest_mm: float) -> tuple[Grid, Grid, Interface]:
+    """Return a grid, the next finer one in it, and the coupling of both.
+
+    With `close_up` the first grid is refined in the sac; all are around wires. Wires are walls of the finer grid where
+    they are thick enough for it.
+    """
     wide = coarse.domain
-    part, layer = window(wide, near_sac(case, wide))
-    domain = domains.build(case.vessel, wide.cell_size_mm / WIDTH, part, wires)
+    wanted = (
+        near_sac(case, wide) if case.numerics.close_up and not coarse.crossings else np.zeros(len(wide.cells), bool)
+    )
+    if case.numerics.wires == "resolved" and case.wires is not None and wide.cell_size_mm > 1.5 * finest_mm:
+        wanted |= near_wires(case, wide)
+    part, layer = window(wide, wanted)
+    size_mm = wide.cell_size_mm / WIDTH
+    domain = domains.build(case.vessel, size_mm, part, domains.wires_of(case, size_mm))
     limit = thickest(case, domain)
     addressing = address(domain, limit)
     layers: Ints = layer[tuple(np.rint(wide.places(domain.centers_mm)).astype(int).T)]
@@ -254,6 +316,7 @@ def _coupled(coarse: Grid, fine: Grid, layer_of_wide: Ints, layer_of_fine: Ints)
         share = _shares(of_cell, written.domain.depth_mm[target], groups)[:, None] * normal[of_cell]
         return stencil(read, written, target, of_cell, share)
 
+    in_wide = wide.cells_at(fine.domain.centers_mm)
     corner = fine.domain.cell_size_mm * (np.indices((WIDTH,) * 3).reshape(3, -1).T - 0.5)
     middle: Ints = np.flatnonzero(layer_of_wide == OWN_LAYER - 1)
     finer = np.stack([fine.domain.cells_at(wide.centers_mm[middle] + offset) for offset in corner], axis=1)
@@ -270,6 +333,7 @@ def _coupled(coarse: Grid, fine: Grid, layer_of_wide: Ints, layer_of_fine: Ints)
         (coarse.addressing.place[middle], fine.addressing.place[finer], group_at(wide.centers_mm[middle])),
         np.zeros((2, groups)),
         sides[1],
+        (inner := np.flatnonzero(sides[1] & (in_wide >= 0)), in_wide[inner]),
     )
     return grids[0], grids[1], coupling
 
@@ -317,7 +381,27 @@ def stencil(read: Grid, written: Grid, target: Ints, group: Ints, share: Floats)
 
     Those with no cell of the first grid near them are left out.
     """
-    source, other = read.domain, written.domain
+    pieces = np.split(target, np.arange(CHUNK, len(target), CHUNK))
+    parts = [_weights(read.domain, written.domain, piece) for piece in pieces]
+    counts, cell = (np.concatenate([part[k] for part in parts]) for k in range(2))
+    weight = np.concatenate([part[2] for part in parts])
+    is_near = counts > 0
+    target, group, share = target[is_near], group[is_near], share[is_near]
+    place, number = np.unique(read.addressing.place[cell], return_inverse=True)
+    return Stencil(
+        place,
+        np.r_[0, np.cumsum(counts[is_near])].astype(np.int32),
+        number.astype(np.int32),
+        weight,
+        written.addressing.place[target],
+        written.limit[target],
+        group,
+        share.astype(np.float32),
+    )
+
+
+def _weights(source: Domain, other: Domain, target: Ints) -> tuple[Ints, Ints, NDArray[np.float32]]:
+    """Return the number (m,) of cells of `source` read for each cell `target` of another grid, them, and weights."""
     at = source.places(other.centers_mm[target])
     corner = np.floor(at).astype(int)
     offset = np.indices((4, 4, 4)).reshape(3, -1).T - 1
@@ -339,22 +423,8 @@ def stencil(read: Grid, written: Grid, target: Ints, group: Ints, share: Floats)
         away = offset - (at - corner)[beside][:, None]
         even[beside], odd[beside] = _beside_wall(source, other, target[beside], cell[beside], away)
     is_used = (cell >= 0) & (even != 0)
-    is_near = is_used.any(axis=1)
-    is_used, cell, even, odd = (values[is_near] for values in (is_used, cell, even, odd))
-    target, group, share = (values[is_near] for values in (target, group, share))
-    start = np.r_[0, np.cumsum(is_used.sum(axis=1))].astype(np.int32)
     weight = np.stack([even[is_used], odd[is_used]], axis=1).astype(np.float32)
-    place, number = np.unique(read.addressing.place[cell[is_used]], return_inverse=True)
-    return Stencil(
-        place,
-        start,
-        number.astype(np.int32),
-        weight,
-        written.addressing.place[target],
-        written.limit[target],
-        group,
-        share.astype(np.float32),
-    )
+    return is_used.sum(axis=1), cell[is_used], weight
 
 
 def _beside_wall(source: Domain, other: Domain, target: Ints, cell: Ints, away: Floats) -> tuple[Floats, Floats]:

@@ -27,7 +27,7 @@ from vstent.flow.lattice.engine import LatticeBoltzmann, trouble
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.levels import WIDTH, require_sac
 from vstent.flow.lattice.state import NECK_INFLOW, Snapshot, State
-from vstent.flow.lattice.stepping import FOLLOWED, advance, monitored, place_screen, snapshot, twin
+from vstent.flow.lattice.stepping import FOLLOWED, advance, monitored, place_screen, snapshot, snapshots, twin
 from vstent.flow.stopping import SURE, fraction_left, standard_error
 from vstent.kernels.arrays import Floats
 from vstent.units import M3_PER_ML, M_PER_MM
@@ -106,7 +106,7 @@ class Stepping:
         """Make the time steps up to the next reading; raise a `DivergenceError` if the flow diverges."""
         advance(self.state, self.reading_steps)
         self.state.since_check = 0
-        now = [snapshot(level) for level in self.state.levels]
+        now = snapshots(self.state)
         if any(one.is_lost for one in now):
             raise DivergenceError(trouble(self.state))
         self.readings.append(self._values(now))
@@ -145,7 +145,7 @@ class Stepping:
     def read(self) -> Reading:
         """Return the averages of neck inflow and sac velocity."""
         if self._read is None:
-            values = np.array(self.readings or [self._values([snapshot(level) for level in self.state.levels])])
+            values = np.array(self.readings or [self._values(snapshots(self.state))])
             (inflow, inflow_error), (velocity, velocity_error) = map(known, values.T[:2])
             errors = {"neck_inflow_mL_s": inflow_error, "sac_velocity_m_s": velocity_error}
             self._read = Reading(inflow, velocity, errors)
@@ -210,7 +210,7 @@ class LiveFlow:
     def __init__(
         self, case: FlowCase, told: Callable[[float], None] | None = None, stored: BareFlow | None = None
     ) -> None:
-        numerics = replace(case.numerics, close_up=True, device_gpu=False, tolerance=TOLERANCE)
+        numerics = replace(case.numerics, close_up=True, wires="screen", device_gpu=False, tolerance=TOLERANCE)
         self.case = replace(case, waveform=None, numerics=numerics)
         self.cell_size_mm = preview_spacing_mm(self.case)
         self.outer = self._around(told) if stored is None else stored.outer
@@ -306,8 +306,8 @@ class LiveFlow:
 
     def field(self) -> FlowField:
         """Return the present flow in the refined region, for streamlines: only its velocity is meaningful."""
-        finest, wall = self.state.finest, self.case.vessel.lumen
-        now, domain = snapshot(finest), finest.domain
+        main, wall = self.state.main, self.case.vessel.lumen
+        now, domain = snapshot(main), main.domain
         n, outer = len(wall.vertices_mm), self.outer
         return replace(
             outer,

@@ -83,7 +83,7 @@ def joined(state: State, flows: Sequence[Reading]) -> Reading:
     A vertex belongs to a finer level where the cells from which its stress is computed lie inside the border.
     """
     wall, result = state.case.vessel.lumen, flows[0]
-    for coarse, fine, flow in zip(state.levels[:-1], state.levels[1:], flows[1:], strict=True):
+    for coarse, fine, flow in zip(state.kept[:-1], state.kept[1:], flows[1:], strict=True):
         assert coarse.interface is not None
         grid = fine.domain
         behind_mm = wall.vertices_mm - grid.cell_size_mm * wall.vertex_normals
@@ -106,12 +106,12 @@ def field_of(
     phases: tuple[Phase, ...] = (),
 ) -> FlowField:
     """Return the flow field of a run from the flow on every level."""
-    vessel, flow, finest = state.case.vessel, joined(state, flows), state.finest
+    vessel, flow, finest = state.case.vessel, joined(state, flows), state.levels[-1]
     section_Pa = domains.section_pressure_Pa(vessel, state.domain, flow.pressure_Pa)
     inlet_Pa, outlet_Pa = vessel.of_inlets_and_outlets(section_Pa)
     levels = tuple(
         Level.of(level.domain, one.velocity_m_s, one.pressure_Pa, one.mean_speed_m_s)
-        for level, one in zip(state.levels, flows, strict=True)
+        for level, one in zip(state.kept, flows, strict=True)
     )
     common_Pa = 0.0
     if state.case.resistances:
@@ -132,7 +132,7 @@ def field_of(
         unsettled_fraction=left,
         advice=advice + _remarks(state, levels, phases),
         residual=np.array(outcome.residual),
-        steps=state.steps * WIDTH ** (len(levels) - 1),
+        steps=state.steps * WIDTH ** (len(state.levels) - 1),
         seconds=outcome.seconds,
         updates_per_s=updates * state.steps / state.loop_seconds,
         phases=phases,
@@ -145,26 +145,25 @@ def field_of(
 
 def _remarks(state: State, levels: Sequence[Level], phases: Sequence[Phase]) -> str:
     """Return sentences on wires, levels, GPU, and on where the grid is too coarse for the vessel or for the flow."""
-    case, finest, remarks = state.case, state.finest.domain, ""
+    case, finest, remarks = state.case, state.levels[-1].domain, ""
     wires = domains.wires_of(case, finest.cell_size_mm)
     if wires is not None:
         remarks += (
             f" The wires are walls, {thickness_mm(wires) / finest.cell_size_mm:.2g} cells thick; {finest.closed_gaps} "
             "cells in gaps narrower than a cell are closed."
         )
-    if len(levels) > 1:
-        sizes = ", ".join(f"{level.cell_size_mm:.3g} mm ({len(level.cells):,} cells)" for level in levels)
+    if len(state.levels) > 1:
+        sizes = ", ".join(f"{one.domain.cell_size_mm:.3g} mm ({len(one.domain.cells):,} cells)" for one in state.levels)
         remarks += f" The grid spacing is {sizes}, from the whole vessel to the finest level."
     if state.device is not None:
         remarks += f" Time steps were launched on the GPU {state.device.how}."
     remarks += domains.too_narrow(case, state.domain.cell_size_mm) + domains.unreached(case.vessel, state.domain)
-    for number, (level, own) in enumerate(zip(state.levels, levels, strict=True)):
+    for number, (level, own) in enumerate(zip(state.kept, levels, strict=True)):
         moments_m_s = [phase.velocity_m_s[number] for phase in phases] or [own.velocity_m_s]
         speed_m_s = np.max([np.linalg.norm(one, axis=1) for one in moments_m_s], axis=0)
         counts = np.repeat(level.limit, level.addressing.length) == CELL_REYNOLDS
-        if level.interface is not None and level.finer is not None:
-            covered = own.cells_at(level.finer.domain.centers_mm)
-            counts[covered[covered >= 0]] = False
+        if level.interface is not None:
+            counts[level.interface.inner[1]] = False
         remarks += domains.too_fast(level.domain, np.where(counts, speed_m_s, 0.0), case.blood, CELL_REYNOLDS)
     return remarks
 

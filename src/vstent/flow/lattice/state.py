@@ -172,9 +172,14 @@ class State:
         return (self,) if self.finer is None else (self, *self.finer.levels)
 
     @property
-    def finest(self) -> "State":
-        """Return the level with the finest grid."""
-        return self.levels[-1]
+    def kept(self) -> "tuple[State, ...]":
+        """Return the levels whose flow is a result: all but the finer ones around wires."""
+        return self.levels[: 1 + self.case.numerics.close_up]
+
+    @property
+    def main(self) -> "State":
+        """Return the level with the grid spacing of the case, which contains the sac."""
+        return self.kept[-1]
 
     @cached_property
     def probe(self) -> Probe:

@@ -18,7 +18,7 @@ from vstent.flow.ends import outflows
 from vstent.flow.lattice.gpu import require_gpu, told
 from vstent.flow.lattice.kernels import d3q19, exchange
 from vstent.flow.lattice.kernels.warm import keep_flow
-from vstent.flow.lattice.levels import CARRIED_DOWN, LACK_PART, PUSH_PART, WIDTH, Interface, Stencil, count, refined
+from vstent.flow.lattice.levels import CARRIED_DOWN, LACK_PART, PUSH_PART, WIDTH, Interface, Stencil, refined, sizes_mm
 from vstent.flow.lattice.scales import Scales, odd_rate
 from vstent.flow.lattice.screen import build_screen
 from vstent.flow.lattice.setup import Grid, Refill, address, behind, build_links, thickest
@@ -49,9 +49,10 @@ def build(
 ) -> State:
     """Set up a run: grids, memory layout, walls, openings, screen and initial flow.
 
-    `cell_size_mm` is the spacing of the finest level. `check_s` is the time between checks and `pace` (m,) the even
-    numbers of time steps of the coarsest level from each to the next, repeated cyclically. The last `kept` checks are
-    kept. Without a `start` the run begins at rest; a pulse begins with the last phase of `start`, if it has phases.
+    `cell_size_mm` is the spacing in the sac (see `levels.sizes_mm`). `check_s` is the time between checks and `pace`
+    (m,) the even numbers of time steps of the coarsest level from each to the next, repeated cyclically. The last
+    `kept` checks are kept. Without a `start` the run begins at rest; a pulse begins with the last phase of `start`, if
+    it has phases.
     """
     if case.numerics.device_gpu:
         require_gpu()
@@ -129,17 +130,16 @@ def _grids(case: FlowCase, cell_size_mm: float) -> list[tuple[Grid, Interface | 
     Flows in the same vessel with the same walls share them.
     """
     built = _GRIDS.setdefault(case.vessel, {})
-    number, are_walls = count(case), domains.wires_of(case, cell_size_mm) is not None
-    key = cell_size_mm, case.sac if number > 1 else None, case.solids if are_walls else ()
+    sizes, numerics = sizes_mm(case, cell_size_mm), case.numerics
+    coarsest_mm, finest_mm = sizes[0], sizes[-1]
+    are_walls = domains.wires_of(case, finest_mm) is not None
+    key = sizes, case.sac if numerics.close_up else None, case.solids if are_walls else ()
     if key not in built:
-        coarsest_mm = cell_size_mm * WIDTH ** (number - 1)
         domain = domains.build(case.vessel, coarsest_mm, wires=domains.wires_of(case, coarsest_mm))
         limit = thickest(case, domain)
         grids: list[tuple[Grid, Interface | None]] = [(Grid(domain, limit, address(domain, limit)), None)]
-        while len(grids) < number:
-            coarse = grids[-1][0]
-            wires = domains.wires_of(case, coarse.domain.cell_size_mm / WIDTH)
-            coarse, fine, between = refined(case, coarse, wires)
+        while len(grids) < len(sizes):
+            coarse, fine, between = refined(case, grids[-1][0], finest_mm)
             grids[-1:] = (coarse, grids[-1][1]), (fine, between)
         built[key] = grids
     return [(grid, between and between.anew()) for grid, between in built[key]]
@@ -191,8 +191,8 @@ def step(state: State) -> None:
     state.loop_seconds += perf_counter() - began
     if state.since_check == state.steps_per_check:
         with np.errstate(over="ignore", invalid="ignore"):  # divergence is reported as an error, not as a warning
-            now = [snapshot(level) for level in state.levels]
-            for level, of_level in zip(state.levels, now, strict=True):
+            now = snapshots(state)
+            for level, of_level in zip(state.kept, now, strict=True):
                 level.snapshots.append(of_level)
             state.history.append(np.zeros(0))
             state.since_check = 0
@@ -424,6 +424,23 @@ def _settle(state: State, part: float) -> None:
     d3q19.balance(refill.lost, refill.groups, refill.refill, share)
 
 
+def snapshots(state: State) -> list[Snapshot]:
+    """Return the present flow on all levels that are kept; a cell that has finer ones has their mean."""
+    now = [snapshot(level) for level in state.levels]
+    for coarse, level, fine in reversed(list(zip(now[:-1], state.levels[:-1], now[1:], strict=True))):
+        assert level.interface is not None
+        finer, cell = level.interface.inner
+        count = np.bincount(cell, minlength=len(coarse.density))
+        covered = np.flatnonzero(count)
+        for values, of_finer, most in (
+            (coarse.density[:, None], fine.density[:, None], count[covered]),
+            (coarse.velocity, fine.velocity, WIDTH**3),  # blood at rest in walls counts
+        ):
+            for column, of_column in zip(values.T, of_finer.T, strict=True):
+                column[covered] = np.bincount(cell, of_column[finer], len(count))[covered] / most
+    return now[: len(state.kept)]
+
+
 def snapshot(state: State) -> Snapshot:
     """Return the present flow; in a screen the velocity includes half of its force."""
     density, velocity, outflow = _read_here(state) if state.device is None else state.device.read()
@@ -452,11 +469,11 @@ def _read_here(state: State) -> tuple[NDArray[np.float32], NDArray[np.float32], 
 def monitored(state: State, now: Sequence[Snapshot]) -> Floats:
     """Return the monitored quantities: mean speed in the sac, inlet pressure, mean speed in the vessel, neck inflow.
 
-    `now` is the flow on every level; sac and neck are read on the finest.
+    `now` is the flow on every level that is kept; sac and neck are read on the finest of them.
     """
     first_inflow = state.links.patch[np.argmax(state.links.is_inflow)]
     inlet = state.domain.link_cell[state.domain.link_patch == first_inflow]
-    velocity_m_s, grid, probe = now[-1].velocity_m_s, state.finest.domain, state.finest.probe
+    velocity_m_s, grid, probe = now[-1].velocity_m_s, state.main.domain, state.main.probe
     values = [speeds(velocity_m_s[probe.cells]).mean(), now[0].pressure_Pa[inlet].mean(), now[0].speed_m_s.mean()]
     if len(probe.ostium_points):
         at, area_mm2 = probe.ostium_points, probe.ostium_area_mm2
