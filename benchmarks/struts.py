@@ -133,7 +133,7 @@ if __name__ == "__main__":
     if given.walls:
         for _, case in cases(given.devices, make(), kept_mm).values():
             if case.solids:
-                computed(case, None, cell_size_mm=given.walls, resolve_wires=True)
+                computed(case, None, cell_size_mm=given.walls, wires="resolved")
         raise SystemExit
     setup.ACROSS = given.across
     rows = json.loads(TABLE.read_text()) if TABLE.exists() else {}

@@ -56,7 +56,7 @@ STATED = {
     "windkessel-proximal": ("0.1", Settings(flow=FlowSettings(proximal_fraction=0.1))),
     "grid-spacing": ("0.2", Settings(flow=FlowSettings(numerics=Numerics(cell_size_mm=0.2)))),
     "refine-sac": ("true", Settings(flow=FlowSettings(numerics=Numerics(close_up=True)))),
-    "resolve-wires": ("yes", Settings(flow=FlowSettings(numerics=Numerics(resolve_wires=True)))),
+    "wires": ("resolved", Settings(flow=FlowSettings(numerics=Numerics(wires="resolved")))),
     "engine": ("openfoam", Settings(flow=FlowSettings(numerics=Numerics(engine="openfoam")))),
     "processes": ("2", Settings(flow=FlowSettings(numerics=Numerics(processes=2)))),
     "gpu": ("yes", Settings(flow=FlowSettings(numerics=Numerics(device_gpu=True)))),

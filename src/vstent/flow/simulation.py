@@ -12,7 +12,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from vstent import plugins
-from vstent.devices.stent import Deployment
+from vstent.devices.stent import Coils, Deployment
 from vstent.errors import InputError, PluginError
 from vstent.flow import sampling
 from vstent.flow.background import BackgroundWork
@@ -133,7 +133,8 @@ def _decided(case: FlowCase) -> tuple[FlowCase, str]:
     """Return a case with its wires as walls or as a screen where that is open, and a sentence with the reason."""
     from vstent.flow.lattice.cost import estimate
 
-    if case.numerics.wires != "auto" or case.numerics.engine != LATTICE or case.wires is None:
+    are_coils = any(isinstance(one, Coils) for one in case.solids)  # their indices are those of a porous region
+    if case.numerics.wires != "auto" or case.numerics.engine != LATTICE or case.wires is None or are_coils:
         return (_with_wires(case, "screen") if case.numerics.wires == "auto" else case), ""
     cost = estimate(_with_wires(case, "resolved"))
     how = f"resolving them would take {cost.seconds / 60:.2g} min and {cost.memory_bytes / 1e9:.2g} GB."

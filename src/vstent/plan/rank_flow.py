@@ -191,10 +191,12 @@ def flow_with(
 ) -> tuple[FlowField | None, Callable[[], Mapping[str, Any]]]:
     """Compute the flow with one candidate, and return it with a function that measures what a ranking keeps of it.
 
-    It starts from the flow with a `similar` device, or from that without one, `start`. Where the flow with a device
-    cannot be computed, it is None, and the function returns an error message; without a device a FlowError is raised.
+    Wires are a screen. The flow starts from that with a `similar` device, or from that without one, `start`. Where the
+    flow with a device cannot be computed, it is None, and the function returns an error message; without a device a
+    FlowError is raised.
     """
-    case = flow_case(anatomy, () if candidate is None else (stent_of(anatomy, candidate),), settings)
+    screened = replace(settings, numerics=replace(settings.numerics, wires="screen"))
+    case = flow_case(anatomy, () if candidate is None else (stent_of(anatomy, candidate),), screened)
     try:
         field = simulate_case(case, start=start, similar=similar)
     except FlowError as error:
