@@ -11,9 +11,9 @@ from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
 from vstent.deployment.struts import united
-from vstent.flow import domain
+from vstent.flow import domain, simulation
 from vstent.flow.case import FlowCase
-from vstent.flow.lattice import stepping
+from vstent.flow.lattice import levels, stepping
 from vstent.flow.lattice.cost import estimate
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.reading import exchanged, force_N
@@ -100,3 +100,35 @@ def test_wires_too_thin_for_the_grid_are_walls_on_a_finer_level(resolved: FlowCa
     made, foretold = sum(len(level.domain.cells) for level in state.levels), estimate(case).cells
     assert made == pytest.approx(foretold, rel=0.25)
     assert state.kept == (state,)
+
+
+def test_wires_on_a_finer_level_are_those_of_the_uniform_fine_grid(
+    resolved: FlowCase, flow: State, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without the screen beside the neck, which the uniform grid has not: pressure, sac and force within 3 %."""
+    monkeypatch.setattr(levels, "BESIDE_NECK", 100.0)
+    case = replace(resolved, media=(), numerics=replace(resolved.numerics, cell_size_mm=2 * CELL_MM))
+    engine = LatticeBoltzmann(2 * CELL_MM)
+    state = engine.init(case, None)
+    while len(state.history) < 16:
+        stepping.step(state)
+    np.testing.assert_allclose(state.history[-1][:3], flow.history[-1][:3], rtol=0.03)
+    force, wanted = force_N(state.levels[-1]), force_N(flow)
+    assert np.linalg.norm(force - wanted) < 0.03 * np.linalg.norm(wanted)
+    between = state.interface
+    assert between is not None
+    assert np.abs(between.lack).max() < 1e-4
+
+
+def test_open_wires_are_decided_by_time_and_the_reason_is_told(
+    resolved: FlowCase, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    is_open = replace(resolved, numerics=replace(resolved.numerics, wires="auto", cell_size_mm=2 * CELL_MM))
+    minutes = estimate(replace(is_open, numerics=replace(is_open.numerics, wires="resolved"))).seconds / 60
+    monkeypatch.setattr(simulation, "QUICK_S", 60 * minutes + 1.0)
+    assert simulation._decided(is_open)[0].numerics.wires == "resolved"
+    monkeypatch.setattr(simulation, "QUICK_S", 60 * minutes - 1.0)
+    chosen, reason = simulation._decided(is_open)
+    assert chosen.numerics.wires == "screen"
+    assert f"The wires are a screen: resolving them would take {minutes:.2g} min" in reason
+    assert reason in simulation.foretell_cost(is_open)

@@ -78,6 +78,8 @@ CHANGING: Final = ("crossed", "lack", "push")
 """Arrays of an `Interface` that change during a run."""
 CHUNK: Final = 50_000
 """Number of cells whose stencils are computed at once."""
+MOST_PUSHED: Final = 0.03
+"""Largest momentum that is added at a border, over that of the cells that are set."""
 REACH: Final = 1.2
 """Standard deviation in cells of the weights of a fit beside a wall."""
 RIDGE: Final = 1e-3
@@ -128,7 +130,7 @@ class Interface:
     lack: Floats
     """(g,) mass taken from the cells beside the border before every pair of steps of the coarser grid."""
     between: tuple[Ints, Ints, Ints]
-    """Cells of both grids in the layer that neither sets (see `exchange.add_jump`)."""
+    """Cells of both grids in the layer that neither sets (see `exchange.jumps`)."""
     push: Floats
     """(2, g) momentum into the finer grid that is added to the cells set on the finer and on the coarser grid."""
     is_trusted: Bools
@@ -222,9 +224,10 @@ def volume_mm3(case: FlowCase, coarse_mm: float) -> float:
     return min(abs(sac.volume_mm3) + pi / 4 * diameter_mm**2 * stretch_mm, abs(case.vessel.closed.volume_mm3))
 
 
-def window(grid: Domain, is_wanted: Bools) -> tuple[Window, Ints]:
+def window(grid: Domain, is_wanted: Bools, is_outer: Bools | None = None) -> tuple[Window, Ints]:
     """Return the part of a grid to be refined around wanted cells (n,), and the layer of every point of the grid.
 
+    It keeps away from the cells (n,) of the grid that are outside the border with a coarser one, and of those carried.
     The layer is 0 outside the part; `CARRIED_UP` and deeper ones have the same number.
     """
     full, shape = np.ones((3, 3, 3), dtype=bool), grid.index.shape
@@ -233,6 +236,10 @@ def window(grid: Domain, is_wanted: Bools) -> tuple[Window, Ints]:
     ends[tuple(grid.cells[grid.link_cell[grid.link_patch > 0]].T)] = True
     within = ndimage.binary_dilation(within, full, RIM, mask=blood)
     within &= ~ndimage.binary_dilation(ends, full, OPENING_CELLS)
+    if is_outer is not None:
+        ends[:] = False
+        ends[tuple(grid.cells[is_outer].T)] = True
+        within &= ~ndimage.binary_dilation(ends, full, WIDTH * len(CARRIED_UP) + 1)
     front = blood & ~within
     within |= ndimage.binary_dilation(within, full) & ~blood  # finer cells may lie between coarser ones and the wall
     layer = np.where(within, CARRIED_UP[-1] + 1, 0)
@@ -270,7 +277,7 @@ def refined(case: FlowCase, coarse: Grid, finest_mm: float) -> tuple[Grid, Grid,
     )
     if case.numerics.wires == "resolved" and case.wires is not None and wide.cell_size_mm > 1.5 * finest_mm:
         wanted |= near_wires(case, wide)
-    part, layer = window(wide, wanted)
+    part, layer = window(wide, wanted, None if coarse.side is None else coarse.side % 2 == 0)
     size_mm = wide.cell_size_mm / WIDTH
     domain = domains.build(case.vessel, size_mm, part, domains.wires_of(case, size_mm))
     limit = thickest(case, domain)

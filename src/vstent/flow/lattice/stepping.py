@@ -18,7 +18,18 @@ from vstent.flow.ends import outflows
 from vstent.flow.lattice.gpu import require_gpu, told
 from vstent.flow.lattice.kernels import d3q19, exchange
 from vstent.flow.lattice.kernels.warm import keep_flow
-from vstent.flow.lattice.levels import CARRIED_DOWN, LACK_PART, PUSH_PART, WIDTH, Interface, Stencil, refined, sizes_mm
+from vstent.flow.lattice.levels import (
+    CARRIED_DOWN,
+    CARRIED_UP,
+    LACK_PART,
+    MOST_PUSHED,
+    PUSH_PART,
+    WIDTH,
+    Interface,
+    Stencil,
+    refined,
+    sizes_mm,
+)
 from vstent.flow.lattice.scales import Scales, odd_rate
 from vstent.flow.lattice.screen import build_screen
 from vstent.flow.lattice.setup import Grid, Refill, address, behind, build_links, thickest
@@ -396,11 +407,13 @@ def _couple(coarse: State, fine: State, between: Interface) -> None:
     """Couple two levels after a pair of steps of the coarser one and two pairs of the finer one."""
     exchange.add_crossed(coarse.populations, between.border[0].first, between.border[0].start, -1.0, between.crossed)
     between.lack[:] += LACK_PART * (between.crossed - between.lack)
-    between.push[1] += PUSH_PART * between.crossed
-    # A jump of the density d accelerates the carried finer cells, about 16 for each coarse cell between, by d / 3.
-    parts = PUSH_PART * len(CARRIED_DOWN) * WIDTH**3 / 3, 0.5 * (1 - 1 / WIDTH**2)
     of_grids = coarse.populations, coarse.addressing.stride, fine.populations, fine.addressing.stride
-    exchange.add_jump(*of_grids, between.between, parts, between.push[0])
+    jump, speed = exchange.jumps(*of_grids, between.between, 0.5 * (1 - 1 / WIDTH**2), len(between.lack)).T
+    # Carried cells for each coarse cell between; a jump of the density d accelerates them by d / 3.
+    cells = len(CARRIED_DOWN) * WIDTH**3, len(CARRIED_UP)
+    for push, missing, count in zip(between.push, (cells[0] * jump / 3, between.crossed), cells, strict=True):
+        most = MOST_PUSHED * count * speed
+        push[:] = np.clip(push + PUSH_PART * missing, -most, most)
     between.crossed[:] = 0.0
     _carry(fine, coarse, between.up, between.push[1], WIDTH)
     _carry(coarse, fine, between.down, between.push[0], 1 / WIDTH)

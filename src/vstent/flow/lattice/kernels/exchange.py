@@ -99,35 +99,38 @@ def add_crossed(f: Any, first: int, start: Any, part: float, crossed: Any) -> No
 
 
 @njit(cache=True, error_model="numpy")
-def _density(f: Any, stride: int, at: int, part: float) -> Any:
-    """Return the density deviation of the cell with storage place `at` on a grid of another spacing.
+def _density(f: Any, stride: int, at: int, part: float) -> tuple[Any, Any]:
+    """Return the density deviation of the cell with storage place `at` on a grid of another spacing, and its speed.
 
-    `part` is that of its correction in shear flow (see `collision.carried`); 0 on the same grid.
+    `part` is that of the correction in shear flow (see `collision.carried`); 0 on the same grid.
     """
     held = np.zeros(19, np.float32)
     for q in range(19):
         held[q] = f[q * stride + at]
     density, u, flux = moments_of(held)
     trace = flux[0] + flux[1] + flux[2] - (u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
-    return density + np.float32(part) * (trace - density)
+    return density + np.float32(part) * (trace - density), np.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
 
 
 @njit(cache=True)
-def add_jump(f: Any, stride: int, g: Any, new_stride: int, overlap: Any, parts: Any, push: Any) -> None:
-    """Add the density of a grid less that of the finer one in the same cells to `push` (g,) of every group.
+def jumps(f: Any, stride: int, g: Any, new_stride: int, overlap: Any, part: float, groups: int) -> Any:
+    """Return the sums (g, 2) over groups: density of a grid less that of the finer one in the same cells, and speed.
 
     Parameters
     ----------
     f, stride, g, new_stride : populations and strides of both grids.
     overlap : tuple; (m,) storage places of coarser cells, (m, 8) of the finer ones in each, and (m,) their groups.
-    parts : tuple; factor of the difference, and of the correction in `_density`.
+    part : that of the correction in `_density`.
     """
     place, finer, group = overlap
+    result = np.zeros((groups, 2))
     for c in range(len(place)):
-        difference = float(_density(f, stride, place[c], parts[1]))
+        difference, speed = _density(f, stride, place[c], part)
         for n in range(finer.shape[1]):
-            difference -= float(_density(g, new_stride, finer[c, n], 0.0)) / finer.shape[1]
-        push[group[c]] += parts[0] * difference
+            difference -= _density(g, new_stride, finer[c, n], 0.0)[0] / np.float32(finer.shape[1])
+        result[group[c], 0] += difference
+        result[group[c], 1] += speed
+    return result
 
 
 @njit(cache=True)
