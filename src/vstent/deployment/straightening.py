@@ -101,7 +101,9 @@ def described(measures: Mapping[str, Any]) -> str:
     )
 
 
-def straighten(anatomy: Anatomy, deployed: Sequence[Deployment], setting: str = "immediate") -> Straightening:
+def straighten(
+    anatomy: Anatomy, deployed: Sequence[Deployment], setting: str = "immediate", place: float = 0.0
+) -> Straightening:
     """Let an artery yield to the devices in it, and deploy these again in the artery that has yielded until both agree.
 
     Parameters
@@ -113,6 +115,8 @@ def straighten(anatomy: Anatomy, deployed: Sequence[Deployment], setting: str = 
     setting : str, optional
         ``immediate`` or ``six_months`` after treatment; or what was measured: the angle by which the artery opens, such
         as ``12deg``, or the radius of its sharpest bend afterwards, such as ``10.7mm``.
+    place : float, optional
+        Where the stiffness of the device relative to wall and bed lies in its range: -1 is the lowest, 1 the highest.
 
     Returns
     -------
@@ -142,10 +146,10 @@ def straighten(anatomy: Anatomy, deployed: Sequence[Deployment], setting: str = 
     rest, yielded, again = artery_beam(anatomy), anatomy, tuple(deployed)
     moved_mm = rest.rest_mm
     for done in range(ROUNDS):
-        given = _device(rest, stents)
         ends_mm = min(one.proximal_abscissa_mm for one in stents), max(one.distal_abscissa_mm for one in stents)
-        share = _shares(rest, given[0], ends_mm, read_straightening(setting))
-        before_mm, moved_mm = moved_mm, settled(rest, share[0] * given[0], moved_mm)
+        likely, low, high = stiffness = _relative(rest, _device(rest, stents), ends_mm, read_straightening(setting))
+        at = likely + abs(place) * ((high if place > 0 else low) - likely)
+        before_mm, moved_mm = moved_mm, settled(rest, at, moved_mm)
         if np.abs(moved_mm - before_mm).max() < (AGREED_MM if done else np.nextafter(0.0, 1.0)):
             moved_mm = before_mm
             break
@@ -153,11 +157,8 @@ def straighten(anatomy: Anatomy, deployed: Sequence[Deployment], setting: str = 
         yielded = moved(anatomy, motion)
         again = _deployed_again(deployed, anatomy, yielded, motion)
         stents = [_on(one.stent, anatomy, yielded) for one in again if not isinstance(one.stent, Coils)]
-    is_given = share[1] == share[2]
     shapes = [rest.rest_mm, moved_mm]
-    shapes += [
-        moved_mm if is_given else settled(rest, a * b, moved_mm) for a, b in zip(share[1:], given[1:], strict=True)
-    ]
+    shapes += [moved_mm if (one == likely).all() else settled(rest, one, moved_mm) for one in stiffness[1:]]
     angle_rad, radius_mm = np.array([measured(one, ends_mm) for one in shapes]).T
     return Straightening(
         on_path(yielded, first),
@@ -230,25 +231,23 @@ def _device(rest: Beam, stents: Sequence[Stent]) -> Floats:
     return found
 
 
-def _shares(rest: Beam, device: Floats, ends_mm: tuple[float, float], setting: str) -> tuple[float, float, float]:
-    """Return the stiffness of the device relative to its own (n,): as likely, lowest and highest."""
-    if setting == "off":
-        return 0.0, 0.0, 0.0
-    if setting in SETTINGS:
-        return SETTINGS[setting]
+def _relative(rest: Beam, device: Floats, ends_mm: tuple[float, float], setting: str) -> Floats:
+    """Return the likely, lowest and highest stiffness (3, n) of a device relative to that of wall and bed."""
+    if setting in ("off", *SETTINGS):
+        return np.array(SETTINGS.get(setting, (0.0, 0.0, 0.0)))[:, None] * device
     unit = setting.lstrip("0123456789.")
     which, value = ("deg", "mm").index(unit), float(setting.removesuffix(unit))
     before = measured(rest.rest_mm, ends_mm)[which]
     wanted = before + np.radians(value) if unit == "deg" else value
 
     def excess(share: float) -> float:
-        return measured(settled(rest, share * device, rest.rest_mm), ends_mm)[which] - wanted
+        return measured(settled(rest, share * device[0], rest.rest_mm), ends_mm)[which] - wanted
 
     reached, last = before, 0.0
     for share in TRIED:
         if (now := excess(share)) >= 0 >= before - wanted:
             share = float(brentq(excess, last, share, xtol=1e-3 * share)) if before < wanted else 0.0
-            return share, share, share
+            return np.tile(share * device[0], (3, 1))
         reached, last = max(reached, now + wanted), share
     if unit == "deg":
         raise InputError(f"The device opens this artery by at most {np.degrees(reached - before):.1f} degrees.")

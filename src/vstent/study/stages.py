@@ -426,7 +426,7 @@ def vary_all(
                     varied = vary_seeds(anatomy, deployment.stent, settings.uncertainty, **how)
                 else:
                     anatomy = on_path(anatomy, deployment.stent.path)
-                    varied = vary(anatomy, deployment, settings.uncertainty, **how)
+                    varied = vary(anatomy, deployment, settings.uncertainty, straightening=settings.straightening, **how)
                 tell(f"{len(varied.points)} deployments; {varied.n_failed} of them did not fit.")
             store.save(stage, keys[stage], varied)
         spreads[treatment.name] = varied.metrics()
