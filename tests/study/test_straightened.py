@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from faults import artery
 
@@ -11,6 +12,8 @@ from vstent.devices.treatment import read_treatment
 from vstent.errors import InputError
 from vstent.flow.settings import FlowSettings, Numerics
 from vstent.io.writers import write_stl
+from vstent.plan.ranges import Ranges
+from vstent.reporting.uncertainty import uncertainty_of
 from vstent.study.pipeline import run
 from vstent.study.settings import Settings
 
@@ -71,3 +74,24 @@ def test_both_effects_have_their_flow(source: Path, tmp_path: Path) -> None:
     for part in ("flow", "straightened/flow", "straightened/bare/flow"):
         assert (tmp_path / "treatments" / "enterprise" / part / "field.vtu").is_file()
     assert json.loads((tmp_path / "metrics.json").read_text())["treatments"]["enterprise"]["straightening"]["bare"]
+
+
+def test_an_uncertainty_study_gives_angle_radius_and_velocity_their_bands(source: Path, tmp_path: Path) -> None:
+    study = settings("enterprise", straightening="six_months", flow=FLOW)
+    found = run(source, tmp_path, replace(study, uncertainty=Ranges(2, flow_samples=2)))
+    treatment = found.metrics["treatments"]["enterprise"]
+    varied = treatment["uncertainty"]["intervals"]
+    low, high = (np.degrees(varied["straightened_rad"][end]) for end in ("low", "high"))
+    (note,) = [note for note in found.notes if note.startswith("Straightening, enterprise: ")]
+    is_unsure = high - low > np.degrees(treatment["straightening"]["straightened_rad"])
+    assert note.startswith("Straightening, enterprise: The band is wider than the effect. ") == is_unsure
+    assert f" degrees ({low:.0f} to {high:.0f}), " in note
+    radius = varied["bend_radius_after_mm"]
+    assert f" ({radius['low']:.1f} to {radius['high']:.1f}) mm, " in note
+    for effect, said in (("", "devices"), ("straightened_bare_", "straightening"), ("straightened_", "both")):
+        band = varied[f"{effect}mean_sac_velocity_m_s_ratio"]
+        assert band["low"] < band["high"]
+        assert f"% ({band['low'] - 1:+.0%} to {band['high'] - 1:+.0%}) by " in note.partition(f" {said}")[0] + " by "
+    (told,) = uncertainty_of(found.metrics, {})
+    assert "the stiffness of the device relative to wall and bed within its range" in told.words
+    assert "Mean sac velocity, after / before, straightened, without device" in [row.name for row in told.rows]

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -87,17 +88,23 @@ class Straightening:
         }
 
 
-def described(measures: Mapping[str, Any]) -> str:
-    """Return the metrics of a straightening as sentences; a band that is wider than the effect comes first."""
-    value, low, high = (
-        round(float(np.degrees(measures[f"straightened{end}_rad"])), 1) + 0.0 for end in ("", "_low", "_high")
-    )
+def described(measures: Mapping[str, Any], intervals: Mapping[str, Mapping[str, float]] = MappingProxyType({})) -> str:
+    """Return the metrics of a straightening as sentences; a band that is wider than the effect comes first.
+
+    The bands are the intervals of an uncertainty study, where it has them.
+    """
+    varied = intervals.get("straightened_rad", {end: measures[f"straightened_{end}_rad"] for end in ("low", "high")})
+    found_rad = measures["straightened_rad"], varied["low"], varied["high"]
+    value, low, high = (round(float(np.degrees(one)), 1) + 0.0 for one in found_rad)
     first = "The band is wider than the effect. " if high - low > abs(value) else ""
     band = f" ({low:.0f} to {high:.0f})" if high > low else ""
     before_mm, after_mm = measures["bend_radius_before_mm"], measures["bend_radius_after_mm"]
+    radius = intervals.get("bend_radius_after_mm")
+    to_mm = f" ({radius['low']:.1f} to {radius['high']:.1f})" if radius else ""
     return (
         f"{first}The artery opens by {value:.1f} degrees{band}, the radius of its sharpest bend changes from "
-        f"{before_mm:.1f} to {after_mm:.1f} mm, and its axis moves by up to {measures['axis_displacement_mm']:.1f} mm."
+        f"{before_mm:.1f} to {after_mm:.1f}{to_mm} mm, and its axis moves by up to "
+        f"{measures['axis_displacement_mm']:.1f} mm."
     )
 
 

@@ -2,9 +2,10 @@
 
 Four causes are varied, each uniformly within plus or minus its range and independently of the others: the threshold of
 the scan (all diameters), the landing position, the manufactured diameter of the device, and the mean inflow. The
-numbers of the device vary with them, each within its range in the catalogue (`vstent.devices.ranges`). In an artery that
-yields, so does the stiffness of the device relative to wall and bed. Points are those of a Sobol sequence, each in the middle of its stratum. Every cause alone is thus sampled evenly, and
-the same study gives the same result. Of coils the seed varies alone.
+numbers of the device vary with them, each within its range in the catalogue (`vstent.devices.ranges`). In an artery
+that yields, so does the stiffness of the device relative to wall and bed. Points are those of a Sobol sequence, each in
+the middle of its stratum. Every cause alone is thus sampled evenly, and the same study gives the same result. Of coils
+the seed varies alone.
 """
 
 from collections.abc import Callable, Mapping
@@ -244,8 +245,8 @@ def _results(
         rows.append(stored)
         if progress is not None:
             progress(number + 1, count)
-    known = *RESULTS, *COIL_RESULTS, *STRAIGHTENED, *FLOW_RESULTS
-    known += tuple(f"{effect}{name}" for name in OF_EFFECTS for effect in EFFECTS)
+    of_effects = (f"{effect}{name}" for name in OF_EFFECTS for effect in EFFECTS)
+    known = *RESULTS, *COIL_RESULTS, *STRAIGHTENED, *FLOW_RESULTS, *of_effects
     names = tuple(name for name in known if any(name in row for row in rows))
     values = np.array([[row.get(name, np.nan) for name in names] for row in rows], dtype=np.float64)
     return names, values.reshape(count, len(names))

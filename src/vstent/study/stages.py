@@ -46,7 +46,7 @@ from vstent.io.images import read_image
 from vstent.kernels.arrays import Floats
 from vstent.plan.bands import bands
 from vstent.plan.treatments import rank_treatments
-from vstent.plan.uncertainty import Uncertainty, vary, vary_seeds
+from vstent.plan.uncertainty import EFFECTS, Uncertainty, vary, vary_seeds
 from vstent.study.folder import flow_folder
 from vstent.study.keys import ALONE, ANATOMY, STRAIGHTENED, VESSEL, flow_stage, stage_name, yields
 from vstent.study.outputs import write_field
@@ -426,7 +426,9 @@ def vary_all(
                     varied = vary_seeds(anatomy, deployment.stent, settings.uncertainty, **how)
                 else:
                     anatomy = on_path(anatomy, deployment.stent.path)
-                    varied = vary(anatomy, deployment, settings.uncertainty, straightening=settings.straightening, **how)
+                    varied = vary(
+                        anatomy, deployment, settings.uncertainty, straightening=settings.straightening, **how
+                    )
                 tell(f"{len(varied.points)} deployments; {varied.n_failed} of them did not fit.")
             store.save(stage, keys[stage], varied)
         spreads[treatment.name] = varied.metrics()
@@ -508,10 +510,18 @@ def straightening_notes(metrics: Mapping[str, Any]) -> tuple[str, ...]:
     notes, key = [], "mean_sac_velocity_m_s_ratio"
     for name, treatment in metrics["treatments"].items():
         if found := treatment.get("straightening"):
-            note = f"Straightening, {name}: {described(found)}"
+            varied = treatment.get("uncertainty", {}).get("intervals", {})
+            note = f"Straightening, {name}: {described(found, varied)}"
             changes = [part.get("change", {}).get(key) for part in (treatment, found.get("bare", {}), found)]
             if all(changes):
-                alone, straight, both = (f"{one - 1:+.0%}" for one in changes)
+                bands = [varied.get(f"{effect}{key}") for effect in ("", *EFFECTS)]
+                pairs = [*zip(changes, bands, strict=True)]
+                is_wide = any(band and band["high"] - band["low"] > abs(one - 1) for one, band in pairs)
+                alone, straight, both = (
+                    f"{one - 1:+.0%}" + (f" ({band['low'] - 1:+.0%} to {band['high'] - 1:+.0%})" if band else "")
+                    for one, band in pairs
+                )
+                note += " A band of the velocity is wider than its effect." if is_wide else ""
                 note += f" Mean sac velocity: {alone} by the devices, {straight} by straightening, {both} by both."
             notes.append(note)
     return tuple(notes)
