@@ -4,7 +4,6 @@ Every node of the axis has a rigid motion, a unit dual quaternion: a rotation an
 these is again a rigid motion, wherever the origin is (Kavan et al. 2008, ACM Trans. Graph. 27:105).
 """
 
-from collections.abc import Iterable
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -17,7 +16,7 @@ from scipy.spatial import cKDTree
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy, Aneurysm, Centerline, Path
 from vstent.kernels import curves
-from vstent.kernels.arrays import Floats
+from vstent.kernels.arrays import Bools, Floats, Ints
 
 NEAREST: Final = 16
 """Number of nodes of the axis whose motions are mixed at a point."""
@@ -46,10 +45,14 @@ class Motion(NamedTuple):
     """Radius of the artery."""
     tube: Surface
     """Closed landing surface before."""
-    lumen_mm: Floats
-    """(v, 3) vertices of the lumen before."""
+    lumen: Surface
+    """Lumen before."""
+    near: cKDTree
+    """Tree of its vertices."""
     of_lumen: Floats
-    """(v, 8) their motions: on the wall of the artery those of the axis, and beyond a neck the mean around it."""
+    """(v, 8) motions of its vertices: on the wall of the artery those of the axis, beyond a neck the mean around it."""
+    after_mm: Floats
+    """(v, 3) its vertices after; sacs keep their volume."""
 
     @classmethod
     def of(cls, anatomy: Anatomy, nodes_mm: Floats, moved_mm: Floats) -> "Motion":
@@ -61,35 +64,58 @@ class Motion(NamedTuple):
         of_nodes = np.concatenate([turns, 0.5 * _product(np.pad(shifts_mm, ((0, 0), (1, 0))), turns)], axis=1)
         lumen, tube = anatomy.vessel.lumen, anatomy.parent.landing_surface.closed
         width_mm = float(np.median(anatomy.parent.section_radius_mm))
-        motion = cls(nodes_mm, of_nodes, width_mm, tube, lumen.vertices_mm, np.zeros((0, 8)))
+        near = cKDTree(lumen.vertices_mm)
+        motion = cls(nodes_mm, of_nodes, width_mm, tube, lumen, near, np.zeros((0, 8)), np.zeros((0, 3)))
+        of_lumen, links = motion._mixed(lumen.vertices_mm), _links(lumen)
         is_wall = tube.signed_distance(lumen.vertices_mm) < OFF_WALL_MM
-        links = _links(lumen)
         piece = connected_components(diags(is_wall * 1.0) @ links @ diags(is_wall * 1.0))[1]
         is_wall &= piece == np.bincount(piece[is_wall]).argmax()  # a dome that touches the artery is not its wall
-        of_lumen = motion._mixed(lumen.vertices_mm)
-        inner = np.flatnonzero(~is_wall)
-        if not len(inner):
-            return motion._replace(of_lumen=of_lumen)
-        balance = csc_matrix(diags(np.asarray(links.sum(axis=1)).ravel()) - links)[inner]
-        smooth = splu(csc_matrix(balance[:, inner])).solve(-balance[:, is_wall] @ of_lumen[is_wall])
-        part = connected_components(links[inner][:, inner])[1]
-        rigid = np.stack([np.bincount(part, column) for column in smooth.T], axis=1) / np.bincount(part)[:, None]
-        points_mm = lumen.vertices_mm[inner]
-        is_beside = is_wall & (links @ (~is_wall * 1.0) > 0)
-        away_mm = np.asarray(cKDTree(lumen.vertices_mm[is_beside]).query(points_mm)[0])
-        off_mm = curves.lengths(_moved_mm(smooth, points_mm) - _moved_mm(rigid[part], points_mm))
-        over_mm = np.full(len(rigid), SOON * width_mm)
-        is_rim = away_mm < SOON * width_mm
-        np.maximum.at(over_mm, part[is_rim], GENTLY * off_mm[is_rim])
-        of_lumen[inner] = smooth + _step(away_mm / over_mm[part])[:, None] * (rigid[part] - smooth)
-        return motion._replace(of_lumen=of_lumen)
+        if not is_wall.all():
+            of_lumen[~is_wall] = motion._beyond(is_wall, of_lumen[is_wall], links)
+        motion = motion._replace(of_lumen=of_lumen, after_mm=_moved_mm(of_lumen, lumen.vertices_mm))
+        for one in anatomy.aneurysms:
+            motion = motion._filled(one.sac)
+        return motion._replace(after_mm=motion._unfolded_mm(links))
 
     def of_points(self, points_mm: Floats) -> Floats:
-        """Return where points (n, 3) move to, in mm: outside the artery with the nearest vertex of the lumen."""
+        """Return where points (n, 3) move to, in mm.
+
+        Those on the lumen stay on their triangle, others outside the artery move with the nearest vertex of the lumen.
+        """
+        found_mm, (on, faces, parts) = self._free_mm(points_mm), self._on_lumen(points_mm)
+        found_mm[on] = np.einsum("nc,ncd->nd", parts, self.after_mm[faces])
+        return found_mm
+
+    def of_normals(self, normals: Floats, points_mm: Floats) -> Floats:
+        """Return unit normals (n, 3) at points (n, 3) after the motion."""
+        turned = self._free_mm(points_mm + 0.1 * normals) - self._free_mm(points_mm)
+        return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
+
+    def of_line(self, line: Centerline) -> Centerline:
+        """Return a line inside the lumen after the motion."""
+        return replace(line, points_mm=self._free_mm(line.points_mm))
+
+    def of_surface(self, surface: Surface) -> Surface:
+        """Return a surface after the motion."""
+        return Surface(self.of_points(surface.vertices_mm), surface.faces)
+
+    def _free_mm(self, points_mm: Floats) -> Floats:
+        """Return where points (n, 3) move to that do not lie on the lumen, in mm."""
         found = self._mixed(points_mm)
         outside = _step(self.tube.signed_distance(points_mm) / (ALONG * self.width_mm))
-        nearest = cKDTree(self.lumen_mm).query(points_mm)[1]
-        return _moved_mm(found + outside[:, None] * (self.of_lumen[nearest] - found), points_mm)
+        beyond = np.flatnonzero(outside)
+        nearest = self.near.query(points_mm[beyond])[1]
+        found[beyond] += outside[beyond, None] * (self.of_lumen[nearest] - found[beyond])
+        return _moved_mm(found, points_mm)
+
+    def _on_lumen(self, points_mm: Floats) -> tuple[Ints, Ints, Floats]:
+        """Return which points lie on the lumen (k,), the vertices of their triangles (k, 3) and the parts of these."""
+        foot_mm, distance_mm, face = self.lumen.closest(points_mm)
+        on = np.flatnonzero(distance_mm < ON_LUMEN_MM)
+        from_mm = self.lumen.corners_mm[face[on]] - foot_mm[on, None]
+        areas = np.cross(np.roll(from_mm, -1, axis=1), np.roll(from_mm, -2, axis=1))
+        parts = np.einsum("ncd,nd->nc", areas, self.lumen.normals[face[on]])
+        return on, self.lumen.faces[face[on]], parts / parts.sum(axis=1, keepdims=True)
 
     def _mixed(self, points_mm: Floats) -> Floats:
         """Return the mean motions (m, 8) of the nodes of the axis near points (m, 3)."""
@@ -100,89 +126,84 @@ class Motion(NamedTuple):
         weight /= weight.sum(axis=1, keepdims=True)
         return np.einsum("mk,mkd->md", weight, self.of_nodes[nearest])
 
+    def _beyond(self, is_wall: Bools, of_wall: Floats, links: csc_matrix) -> Floats:
+        """Return the motions (w, 8) of the lumen beyond the wall (v,): smooth at necks, and rigid away from them."""
+        inner, vertices_mm = np.flatnonzero(~is_wall), self.lumen.vertices_mm
+        balance = csc_matrix(diags(np.asarray(links.sum(axis=1)).ravel()) - links)[inner]
+        smooth = splu(csc_matrix(balance[:, inner])).solve(-balance[:, is_wall] @ of_wall)
+        part = connected_components(links[inner][:, inner])[1]
+        rigid = np.stack([np.bincount(part, column) for column in smooth.T], axis=1) / np.bincount(part)[:, None]
+        points_mm = vertices_mm[inner]
+        is_beside = is_wall & (links @ (~is_wall * 1.0) > 0)
+        away_mm = np.asarray(cKDTree(vertices_mm[is_beside]).query(points_mm)[0])
+        off_mm = curves.lengths(_moved_mm(smooth, points_mm) - _moved_mm(rigid[part], points_mm))
+        over_mm = np.full(len(rigid), SOON * self.width_mm)
+        is_rim = away_mm < SOON * self.width_mm
+        np.maximum.at(over_mm, part[is_rim], GENTLY * off_mm[is_rim])
+        return np.asarray(smooth + _step(away_mm / over_mm[part])[:, None] * (rigid[part] - smooth))
+
+    def _filled(self, sac: Surface) -> "Motion":
+        """Return the motion with which a sac keeps its volume, since blood fills it."""
+        is_own = sac.closest(self.lumen.vertices_mm)[1] < ON_LUMEN_MM
+        away_mm = np.asarray(cKDTree(self.lumen.vertices_mm[~is_own]).query(self.lumen.vertices_mm[is_own])[0])
+        share, after_mm = _step(away_mm / (SOON * self.width_mm))[:, None], self.after_mm.copy()
+        sac_mm, (on, faces, parts) = self._free_mm(sac.vertices_mm), self._on_lumen(sac.vertices_mm)
+        for _ in range(2):
+            sac_mm[on] = np.einsum("nc,ncd->nd", parts, after_mm[faces])
+            wider = np.cbrt(sac.volume_mm3 / Surface(sac_mm, sac.faces).volume_mm3) - 1
+            after_mm[is_own] += wider * share * (after_mm[is_own] - after_mm[is_own].mean(axis=0))
+        return self._replace(after_mm=after_mm)
+
+    def _unfolded_mm(self, links: csc_matrix) -> Floats:
+        """Return the vertices (v, 3) of the lumen after, smoothed where a triangle would be turned over."""
+        moves_mm, faces = self.after_mm - self.lumen.vertices_mm, self.lumen.faces
+        of_faces = self.of_lumen[faces[:, 0], :4]
+        normals = _turned(of_faces / np.linalg.norm(of_faces, axis=1, keepdims=True), self.lumen.normals)
+        for _ in range(UNFOLDINGS):
+            after = Surface(self.lumen.vertices_mm + moves_mm, faces)
+            is_turned = np.einsum("fi,fi->f", after.normals, normals) < 0
+            if not is_turned.any():
+                break
+            beside = np.unique(faces[is_turned])
+            moves_mm[beside] = (links[beside] @ moves_mm) / np.asarray(links[beside].sum(axis=1))
+        return np.asarray(self.lumen.vertices_mm + moves_mm)
+
 
 def moved(anatomy: Anatomy, motion: Motion) -> Anatomy:
     """Return an anatomy after a motion: lumen, openings, centerlines, paths, sacs and necks."""
-    lumen = anatomy.vessel.lumen
-    after_mm = _unfolded_mm(lumen, motion.of_lumen)
-
-    def of_points(points_mm: Floats) -> Floats:
-        """Return points (n, 3) after the motion; those on the lumen stay on their triangle."""
-        found_mm = motion.of_points(points_mm)
-        foot_mm, distance_mm, face = lumen.closest(points_mm)
-        on = np.flatnonzero(distance_mm < ON_LUMEN_MM)
-        from_mm = lumen.corners_mm[face[on]] - foot_mm[on, None]
-        parts = np.cross(np.roll(from_mm, -1, axis=1), np.roll(from_mm, -2, axis=1)) @ lumen.normals[face[on], :, None]
-        found_mm[on] = np.einsum("ncd,nc->nd", after_mm[lumen.faces[face[on]]], parts[..., 0]) / parts.sum(axis=1)
-        return found_mm
-
-    def of_normal(normal: Floats, point_mm: Floats) -> Floats:
-        """Return a unit normal (3,) at a point after the motion."""
-        turned = np.diff(motion.of_points(np.stack([point_mm, point_mm + 0.1 * normal])), axis=0)[0]
-        return np.asarray(turned / np.linalg.norm(turned))
-
-    def of_lines(lines: Iterable[Centerline]) -> tuple[Centerline, ...]:
-        return tuple(replace(line, points_mm=motion.of_points(line.points_mm)) for line in lines)
-
-    def of_sac(sac: Surface, neck_mm: Floats) -> Surface:
-        """Return a sac; blood fills it, so that it keeps its volume where its neck becomes narrower."""
-        own = np.flatnonzero(sac.closest(lumen.vertices_mm)[1] < ON_LUMEN_MM)
-        away_mm = np.asarray(cKDTree(neck_mm).query(lumen.vertices_mm[own])[0])
-        share = _step(away_mm / (SOON * motion.width_mm))[:, None]
-        for _ in range(2):
-            wider = np.cbrt(sac.volume_mm3 / Surface(of_points(sac.vertices_mm), sac.faces).volume_mm3) - 1
-            after_mm[own] += wider * share * (after_mm[own] - after_mm[own].mean(axis=0))
-        return Surface(of_points(sac.vertices_mm), sac.faces)
 
     def of_aneurysm(one: Aneurysm) -> Aneurysm:
-        sac, plane = of_sac(one.sac, one.neck_mm), one.plane
+        plane = one.plane
         if plane is not None:
-            normal = of_normal(plane.normal, plane.center_mm)
-            plane = replace(plane, normal=normal, rim_mm=of_points(plane.rim_mm))
-        return Aneurysm(sac, Surface(of_points(one.neck.vertices_mm), one.neck.faces), of_points(one.neck_mm), plane)
+            normal = motion.of_normals(plane.normal[None], plane.center_mm[None])[0]
+            plane = replace(plane, normal=normal, rim_mm=motion.of_points(plane.rim_mm))
+        sac, neck = map(motion.of_surface, (one.sac, one.neck))
+        return Aneurysm(sac, neck, motion.of_points(one.neck_mm), plane)
 
     def of_path(path: Path) -> Path:
-        surface = path.landing_surface
-        landing = Surface(motion.of_points(surface.vertices_mm), surface.faces)
-        return replace(path, axis=of_lines([path.axis])[0], landing_surface=landing)
+        landing_surface = motion.of_surface(path.landing_surface)
+        return replace(path, axis=motion.of_line(path.axis), landing_surface=landing_surface)
 
-    openings = anatomy.vessel.openings
-    centers_mm = motion.of_points(np.array([one.center_mm for one in openings]))
-    normals = [of_normal(one.normal, one.center_mm) for one in openings]
+    vessel = anatomy.vessel
+    centers_mm, normals = (
+        np.array([getattr(one, name) for one in vessel.openings]) for name in ("center_mm", "normal")
+    )
+    openings = zip(vessel.openings, motion.of_points(centers_mm), motion.of_normals(normals, centers_mm), strict=True)
     points_mm = motion.of_points(np.array([one.point_mm for one in anatomy.candidates]).reshape(-1, 3))
-    aneurysms = tuple(map(of_aneurysm, anatomy.aneurysms))
     return replace(
         anatomy,
         vessel=replace(
-            anatomy.vessel,
-            lumen=Surface(after_mm, lumen.faces),
-            openings=tuple(
-                replace(one, center_mm=center_mm, normal=normal)
-                for one, center_mm, normal in zip(openings, centers_mm, normals, strict=True)
-            ),
-            centerlines=of_lines(anatomy.vessel.centerlines),
+            vessel,
+            lumen=Surface(motion.after_mm, vessel.lumen.faces),
+            openings=tuple(replace(one, center_mm=center_mm, normal=normal) for one, center_mm, normal in openings),
+            centerlines=tuple(map(motion.of_line, vessel.centerlines)),
         ),
         paths=tuple(map(of_path, anatomy.paths)),
-        aneurysms=aneurysms,
+        aneurysms=tuple(map(of_aneurysm, anatomy.aneurysms)),
         candidates=tuple(
             replace(one, point_mm=point_mm) for one, point_mm in zip(anatomy.candidates, points_mm, strict=True)
         ),
     )
-
-
-def _unfolded_mm(surface: Surface, motions: Floats) -> Floats:
-    """Return the vertices (v, 3) after motions (v, 8), smoothed where a triangle would be turned over."""
-    moves_mm, links = _moved_mm(motions, surface.vertices_mm) - surface.vertices_mm, _links(surface)
-    of_faces = motions[surface.faces[:, 0], :4]
-    normals = _turned(of_faces / np.linalg.norm(of_faces, axis=1, keepdims=True), surface.normals)
-    for _ in range(UNFOLDINGS):
-        after = Surface(surface.vertices_mm + moves_mm, surface.faces)
-        is_turned = np.einsum("fi,fi->f", after.normals, normals) < 0
-        if not is_turned.any():
-            break
-        beside = np.unique(surface.faces[is_turned])
-        moves_mm[beside] = (links[beside] @ moves_mm) / np.asarray(links[beside].sum(axis=1))
-    return np.asarray(surface.vertices_mm + moves_mm)
 
 
 def _step(x: Floats) -> Floats:
