@@ -9,12 +9,14 @@ from scipy.integrate import solve_bvp
 from scipy.optimize import brentq
 from tubes import arc, tube
 
+from vstent.anatomy.read import read_vessel
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
 from vstent.deployment import straightening
 from vstent.deployment.beam import Beam
 from vstent.deployment.deploy import deploy
+from vstent.deployment.motion import Motion, Skin, moved
 from vstent.deployment.straightening import SETTINGS, beam_of, measured, read_straightening, settled, straighten
 from vstent.devices.catalogue import find_design
 from vstent.devices.stent import Landing
@@ -203,10 +205,32 @@ def test_a_sac_keeps_its_volume_and_no_triangle_turns_over():
     assert after.sac.volume_mm3 == pytest.approx(before.sac.volume_mm3, rel=0.01)
     assert np.linalg.norm(after.sac.vertices_mm - before.sac.vertices_mm, axis=1).max() > 0.3
     for one, other in ((anatomy.vessel.lumen, found.anatomy.vessel.lumen), (before.sac, after.sac)):
-        assert np.einsum("ij,ij->i", one.normals, other.normals).min() > 0.5
+        assert np.einsum("ij,ij->i", one.normals, other.normals).min() > 0.8
     on_wall = anatomy.vessel.lumen.closest(before.sac.vertices_mm)[1] < 1e-6
     assert found.anatomy.vessel.lumen.closest(after.sac.vertices_mm[on_wall])[1].max() < 1e-6
     began = time.process_time()
     beam = straightening.artery_beam(anatomy)
     settled(beam, 0.3 * straightening._device(beam, [deployed.stent])[0], beam.rest_mm)
     assert time.process_time() - began < 1.0
+
+
+@pytest.mark.parametrize("file", ["aneurisk_C0038.vtp", "aneurisk/C0016.vtp"])
+def test_no_triangle_of_a_patient_turns_over(file, shared_data):
+    """Their sacs lose 13 and 7 % where the neck narrows; the sac of C0038 is cut off a branch 5 mm from the neck."""
+    anatomy = restore(trim(trace(read_vessel(shared_data / file))))
+    deployed = deploy("enterprise", anatomy)
+    found = straighten(anatomy, [deployed], "six_months")
+    assert np.degrees(found.metrics()["straightened_rad"]) > 15
+    before, after = anatomy.vessel.lumen, found.anatomy.vessel.lumen
+    assert np.einsum("ij,ij->i", before.normals, after.normals).min() > 0.3
+    (sac,), (other,) = anatomy.aneurysms, found.anatomy.aneurysms
+    assert other.sac.volume_mm3 == pytest.approx(sac.sac.volume_mm3, rel=0.01)
+    rest = straightening.artery_beam(anatomy)
+    device = straightening._device(rest, [deployed.stent])[0]
+    skin, moved_mm = Skin(anatomy, rest.rest_mm), settled(rest, 0.5 * device, rest.rest_mm)
+    began = time.process_time()
+    moved(Motion.of(skin, moved_mm))
+    assert time.process_time() - began < 2.0
+    began = time.process_time()
+    Motion.of(skin, moved_mm)  # as the page redraws it
+    assert time.process_time() - began < 0.5

@@ -4,13 +4,14 @@ Every node of the axis has a rigid motion, a unit dual quaternion: a rotation an
 these is again a rigid motion, wherever the origin is (Kavan et al. 2008, ACM Trans. Graph. 27:105).
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_matrix, csc_matrix, diags
+from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, diags
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial import cKDTree
 
 from vstent.geometry.surface import Surface
@@ -34,81 +35,85 @@ ON_LUMEN_MM: Final = 1e-4
 """Distance from the lumen, in mm, below which a point moves with its triangle, since sacs are cut from the lumen."""
 
 
-class Motion(NamedTuple):
-    """A smooth motion of a vessel and of all that is in it."""
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """How a vessel hangs on the axis of its first path: what does not depend on where the axis moves."""
 
+    anatomy: Anatomy
+    """The vessel before."""
     nodes_mm: Floats
     """(n, 3) nodes of the axis before."""
-    of_nodes: Floats
-    """(n, 8) their motions."""
-    width_mm: float
-    """Radius of the artery."""
-    tube: Surface
-    """Closed landing surface before."""
-    lumen: Surface
-    """Lumen before."""
-    near: cKDTree
-    """Tree of its vertices."""
-    of_lumen: Floats
-    """(v, 8) motions of its vertices: on the wall of the artery those of the axis, beyond a neck the mean around it."""
-    after_mm: Floats
-    """(v, 3) its vertices after; sacs keep their volume."""
 
-    @classmethod
-    def of(cls, anatomy: Anatomy, nodes_mm: Floats, moved_mm: Floats) -> "Motion":
-        """Return the motion of an artery whose axis, of the first path, has nodes (n, 3) before and after."""
-        before, after = curves.tangents(nodes_mm), curves.tangents(moved_mm)
-        turns = np.concatenate([1 + np.einsum("ni,ni->n", before, after)[:, None], np.cross(before, after)], axis=1)
-        turns /= np.linalg.norm(turns, axis=1, keepdims=True)
-        shifts_mm = moved_mm - _turned(turns, nodes_mm)
-        of_nodes = np.concatenate([turns, 0.5 * _product(np.pad(shifts_mm, ((0, 0), (1, 0))), turns)], axis=1)
-        lumen, tube = anatomy.vessel.lumen, anatomy.parent.landing_surface.closed
-        width_mm = float(np.median(anatomy.parent.section_radius_mm))
-        near = cKDTree(lumen.vertices_mm)
-        motion = cls(nodes_mm, of_nodes, width_mm, tube, lumen, near, np.zeros((0, 8)), np.zeros((0, 3)))
-        of_lumen, links = motion._mixed(lumen.vertices_mm), _links(lumen)
-        is_wall = tube.signed_distance(lumen.vertices_mm) < OFF_WALL_MM
-        piece = connected_components(diags(is_wall * 1.0) @ links @ diags(is_wall * 1.0))[1]
-        is_wall &= piece == np.bincount(piece[is_wall]).argmax()  # a dome that touches the artery is not its wall
-        if not is_wall.all():
-            of_lumen[~is_wall] = motion._beyond(is_wall, of_lumen[is_wall], links)
-        motion = motion._replace(of_lumen=of_lumen, after_mm=_moved_mm(of_lumen, lumen.vertices_mm))
-        for one in anatomy.aneurysms:
-            motion = motion._filled(one.sac)
-        return motion._replace(after_mm=motion._unfolded_mm(links))
+    @cached_property
+    def lumen(self) -> Surface:
+        """Lumen before."""
+        return self.anatomy.vessel.lumen
 
-    def of_points(self, points_mm: Floats) -> Floats:
-        """Return where points (n, 3) move to, in mm.
+    @cached_property
+    def width_mm(self) -> float:
+        """Radius of the artery."""
+        return float(np.median(self.anatomy.parent.section_radius_mm))
 
-        Those on the lumen stay on their triangle, others outside the artery move with the nearest vertex of the lumen.
-        """
-        found_mm, (on, faces, parts) = self._free_mm(points_mm), self._on_lumen(points_mm)
-        found_mm[on] = np.einsum("nc,ncd->nd", parts, self.after_mm[faces])
-        return found_mm
+    @cached_property
+    def tube(self) -> Surface:
+        """Closed landing surface before."""
+        return self.anatomy.parent.landing_surface.closed
 
-    def of_normals(self, normals: Floats, points_mm: Floats) -> Floats:
-        """Return unit normals (n, 3) at points (n, 3) after the motion."""
-        turned = self._free_mm(points_mm + 0.1 * normals) - self._free_mm(points_mm)
-        return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
+    @cached_property
+    def near(self) -> cKDTree:
+        """Tree of the vertices of the lumen."""
+        return cKDTree(self.lumen.vertices_mm)
 
-    def of_line(self, line: Centerline) -> Centerline:
-        """Return a line inside the lumen after the motion."""
-        return replace(line, points_mm=self._free_mm(line.points_mm))
+    @cached_property
+    def links(self) -> csc_matrix:
+        """Matrix (v, v) of the edges of the lumen."""
+        return _links(self.lumen)
 
-    def of_surface(self, surface: Surface) -> Surface:
-        """Return a surface after the motion."""
-        return Surface(self.of_points(surface.vertices_mm), surface.faces)
+    @cached_property
+    def is_wall(self) -> Bools:
+        """(v,) which vertices of the lumen are the artery's wall."""
+        is_wall = self.tube.signed_distance(self.lumen.vertices_mm) < OFF_WALL_MM
+        piece = connected_components(diags(is_wall * 1.0) @ self.links @ diags(is_wall * 1.0))[1]
+        # A dome that touches the artery is not its wall.
+        return np.asarray(is_wall & (piece == np.bincount(piece[is_wall]).argmax()))
 
-    def _free_mm(self, points_mm: Floats) -> Floats:
-        """Return where points (n, 3) move to that do not lie on the lumen, in mm."""
-        found = self._mixed(points_mm)
-        outside = _step(self.tube.signed_distance(points_mm) / (ALONG * self.width_mm))
-        beyond = np.flatnonzero(outside)
-        nearest = self.near.query(points_mm[beyond])[1]
-        found[beyond] += outside[beyond, None] * (self.of_lumen[nearest] - found[beyond])
-        return _moved_mm(found, points_mm)
+    @cached_property
+    def mixed(self) -> csr_matrix:
+        """Matrix (v, n) by which the lumen mixes the motions of the nodes."""
+        return self.mixing(self.lumen.vertices_mm)
 
-    def _on_lumen(self, points_mm: Floats) -> tuple[Ints, Ints, Floats]:
+    @cached_property
+    def beyond(self) -> tuple[Ints, SuperLU, csc_matrix, Ints, Floats]:
+        """Vertices beyond the wall (w,), their balance, that of the wall, their part, and their distance from it."""
+        inner, vertices_mm = np.flatnonzero(~self.is_wall), self.lumen.vertices_mm
+        balance = csc_matrix(diags(np.asarray(self.links.sum(axis=1)).ravel()) - self.links)[inner]
+        part = connected_components(self.links[inner][:, inner])[1]
+        is_beside = self.is_wall & (self.links @ (~self.is_wall * 1.0) > 0)
+        away_mm = np.asarray(cKDTree(vertices_mm[is_beside]).query(vertices_mm[inner])[0])
+        return inner, splu(csc_matrix(balance[:, inner])), csc_matrix(-balance[:, self.is_wall]), part, away_mm
+
+    @cached_property
+    def sacs(self) -> tuple[tuple[Surface, Bools, Floats, tuple[Ints, Ints, Floats]], ...]:
+        """Every sac, its vertices of the lumen (v,), how far they are from all others, and its own vertices on them."""
+        found, vertices_mm = [], self.lumen.vertices_mm
+        for sac in (one.sac for one in self.anatomy.aneurysms):
+            is_own = sac.closest(vertices_mm)[1] < ON_LUMEN_MM
+            away_mm = np.asarray(cKDTree(vertices_mm[~is_own]).query(vertices_mm[is_own])[0])
+            share = _step(away_mm / (SOON * self.width_mm))[:, None]
+            found.append((sac, is_own, share, self.on_lumen(sac.vertices_mm)))
+        return tuple(found)
+
+    def mixing(self, points_mm: Floats) -> csr_matrix:
+        """Return the matrix (m, n) by which points (m, 3) mix the motions of the nodes of the axis near them."""
+        k = min(NEAREST, len(self.nodes_mm))
+        away_mm, nearest = map(np.asarray, cKDTree(self.nodes_mm).query(points_mm, k=k))
+        weight = np.exp((away_mm[:, :1] ** 2 - away_mm**2) / (2 * (ALONG * self.width_mm) ** 2))
+        weight -= weight[:, -1:]  # a node that leaves the nearest ones has no weight
+        weight /= weight.sum(axis=1, keepdims=True)
+        rows = np.repeat(np.arange(len(points_mm)), k)
+        return csr_matrix((weight.ravel(), (rows, nearest.ravel())), shape=(len(points_mm), len(self.nodes_mm)))
+
+    def on_lumen(self, points_mm: Floats) -> tuple[Ints, Ints, Floats]:
         """Return which points lie on the lumen (k,), the vertices of their triangles (k, 3) and the parts of these."""
         foot_mm, distance_mm, face = self.lumen.closest(points_mm)
         on = np.flatnonzero(distance_mm < ON_LUMEN_MM)
@@ -117,60 +122,79 @@ class Motion(NamedTuple):
         parts = np.einsum("ncd,nd->nc", areas, self.lumen.normals[face[on]])
         return on, self.lumen.faces[face[on]], parts / parts.sum(axis=1, keepdims=True)
 
-    def _mixed(self, points_mm: Floats) -> Floats:
-        """Return the mean motions (m, 8) of the nodes of the axis near points (m, 3)."""
-        k = min(NEAREST, len(self.nodes_mm))
-        away_mm, nearest = map(np.asarray, cKDTree(self.nodes_mm).query(points_mm, k=k))
-        weight = np.exp((away_mm[:, :1] ** 2 - away_mm**2) / (2 * (ALONG * self.width_mm) ** 2))
-        weight -= weight[:, -1:]  # a node that leaves the nearest ones has no weight
-        weight /= weight.sum(axis=1, keepdims=True)
-        return np.einsum("mk,mkd->md", weight, self.of_nodes[nearest])
 
-    def _beyond(self, is_wall: Bools, of_wall: Floats, links: csc_matrix) -> Floats:
-        """Return the motions (w, 8) of the lumen beyond the wall (v,): smooth at necks, and rigid away from them."""
-        inner, vertices_mm = np.flatnonzero(~is_wall), self.lumen.vertices_mm
-        balance = csc_matrix(diags(np.asarray(links.sum(axis=1)).ravel()) - links)[inner]
-        smooth = splu(csc_matrix(balance[:, inner])).solve(-balance[:, is_wall] @ of_wall)
-        part = connected_components(links[inner][:, inner])[1]
-        rigid = np.stack([np.bincount(part, column) for column in smooth.T], axis=1) / np.bincount(part)[:, None]
-        points_mm = vertices_mm[inner]
-        is_beside = is_wall & (links @ (~is_wall * 1.0) > 0)
-        away_mm = np.asarray(cKDTree(vertices_mm[is_beside]).query(points_mm)[0])
-        off_mm = curves.lengths(_moved_mm(smooth, points_mm) - _moved_mm(rigid[part], points_mm))
-        over_mm = np.full(len(rigid), SOON * self.width_mm)
-        is_rim = away_mm < SOON * self.width_mm
-        np.maximum.at(over_mm, part[is_rim], GENTLY * off_mm[is_rim])
-        return np.asarray(smooth + _step(away_mm / over_mm[part])[:, None] * (rigid[part] - smooth))
+class Motion(NamedTuple):
+    """A smooth motion of a vessel and of all that is in it."""
 
-    def _filled(self, sac: Surface) -> "Motion":
-        """Return the motion with which a sac keeps its volume, since blood fills it."""
-        is_own = sac.closest(self.lumen.vertices_mm)[1] < ON_LUMEN_MM
-        away_mm = np.asarray(cKDTree(self.lumen.vertices_mm[~is_own]).query(self.lumen.vertices_mm[is_own])[0])
-        share, after_mm = _step(away_mm / (SOON * self.width_mm))[:, None], self.after_mm.copy()
-        sac_mm, (on, faces, parts) = self._free_mm(sac.vertices_mm), self._on_lumen(sac.vertices_mm)
-        for _ in range(2):
-            sac_mm[on] = np.einsum("nc,ncd->nd", parts, after_mm[faces])
-            wider = np.cbrt(sac.volume_mm3 / Surface(sac_mm, sac.faces).volume_mm3) - 1
-            after_mm[is_own] += wider * share * (after_mm[is_own] - after_mm[is_own].mean(axis=0))
-        return self._replace(after_mm=after_mm)
+    skin: Skin
+    """The vessel before."""
+    of_nodes: Floats
+    """(n, 8) motions of the nodes of its axis."""
+    of_lumen: Floats
+    """(v, 8) motions of its lumen: on the wall those of the axis, and beyond a neck the mean around it."""
+    after_mm: Floats
+    """(v, 3) vertices of the lumen after; sacs keep their volume."""
 
-    def _unfolded_mm(self, links: csc_matrix) -> Floats:
-        """Return the vertices (v, 3) of the lumen after, smoothed where a triangle would be turned over."""
-        moves_mm, faces = self.after_mm - self.lumen.vertices_mm, self.lumen.faces
-        of_faces = self.of_lumen[faces[:, 0], :4]
-        normals = _turned(of_faces / np.linalg.norm(of_faces, axis=1, keepdims=True), self.lumen.normals)
-        for _ in range(UNFOLDINGS):
-            after = Surface(self.lumen.vertices_mm + moves_mm, faces)
-            is_turned = np.einsum("fi,fi->f", after.normals, normals) < 0
-            if not is_turned.any():
-                break
-            beside = np.unique(faces[is_turned])
-            moves_mm[beside] = (links[beside] @ moves_mm) / np.asarray(links[beside].sum(axis=1))
-        return np.asarray(self.lumen.vertices_mm + moves_mm)
+    @classmethod
+    def of(cls, skin: Skin, moved_mm: Floats) -> "Motion":
+        """Return the motion of a vessel whose axis has nodes (n, 3) after it."""
+        before, after = curves.tangents(skin.nodes_mm), curves.tangents(moved_mm)
+        turns = np.concatenate([1 + np.einsum("ni,ni->n", before, after)[:, None], np.cross(before, after)], axis=1)
+        turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+        shifts_mm = moved_mm - _turned(turns, skin.nodes_mm)
+        of_nodes = np.concatenate([turns, 0.5 * _product(np.pad(shifts_mm, ((0, 0), (1, 0))), turns)], axis=1)
+        of_lumen = skin.mixed @ of_nodes
+        if not skin.is_wall.all():
+            of_lumen[~skin.is_wall] = _beyond(skin, of_lumen[skin.is_wall])
+        motion = cls(skin, of_nodes, of_lumen, _moved_mm(of_lumen, skin.lumen.vertices_mm))
+        return motion._replace(after_mm=_unfolded_mm(skin, of_lumen, motion._filled_mm()))
+
+    def of_points(self, points_mm: Floats) -> Floats:
+        """Return where points (n, 3) move to, in mm.
+
+        Those on the lumen stay on their triangle, others outside the artery move with the nearest vertex of the lumen.
+        """
+        found_mm, (on, faces, parts) = self.of_inner(points_mm), self.skin.on_lumen(points_mm)
+        found_mm[on] = np.einsum("nc,ncd->nd", parts, self.after_mm[faces])
+        return found_mm
+
+    def of_inner(self, points_mm: Floats) -> Floats:
+        """Return where points (n, 3) move to that do not lie on the lumen, in mm."""
+        found = self.skin.mixing(points_mm) @ self.of_nodes
+        outside = _step(self.skin.tube.signed_distance(points_mm) / (ALONG * self.skin.width_mm))
+        beyond = np.flatnonzero(outside)
+        nearest = self.skin.near.query(points_mm[beyond])[1]
+        found[beyond] += outside[beyond, None] * (self.of_lumen[nearest] - found[beyond])
+        return _moved_mm(found, points_mm)
+
+    def of_normals(self, normals: Floats, points_mm: Floats) -> Floats:
+        """Return unit normals (n, 3) at points (n, 3) after the motion."""
+        turned = self.of_inner(points_mm + 0.1 * normals) - self.of_inner(points_mm)
+        return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
+
+    def of_line(self, line: Centerline) -> Centerline:
+        """Return a line inside the lumen after the motion."""
+        return replace(line, points_mm=self.of_inner(line.points_mm))
+
+    def of_surface(self, surface: Surface) -> Surface:
+        """Return a surface after the motion."""
+        return Surface(self.of_points(surface.vertices_mm), surface.faces)
+
+    def _filled_mm(self) -> Floats:
+        """Return the vertices (v, 3) of the lumen with sacs as large as before: blood fills them."""
+        after_mm = self.after_mm.copy()
+        for sac, is_own, share, (on, faces, parts) in self.skin.sacs:
+            sac_mm = self.of_inner(sac.vertices_mm)
+            for _ in range(2):
+                sac_mm[on] = np.einsum("nc,ncd->nd", parts, after_mm[faces])
+                wider = np.cbrt(sac.volume_mm3 / Surface(sac_mm, sac.faces).volume_mm3) - 1
+                after_mm[is_own] += wider * share * (after_mm[is_own] - after_mm[is_own].mean(axis=0))
+        return after_mm
 
 
-def moved(anatomy: Anatomy, motion: Motion) -> Anatomy:
-    """Return an anatomy after a motion: lumen, openings, centerlines, paths, sacs and necks."""
+def moved(motion: Motion) -> Anatomy:
+    """Return the anatomy after a motion: lumen, openings, centerlines, paths, sacs and necks."""
+    anatomy = motion.skin.anatomy
 
     def of_aneurysm(one: Aneurysm) -> Aneurysm:
         plane = one.plane
@@ -204,6 +228,33 @@ def moved(anatomy: Anatomy, motion: Motion) -> Anatomy:
             replace(one, point_mm=point_mm) for one, point_mm in zip(anatomy.candidates, points_mm, strict=True)
         ),
     )
+
+
+def _beyond(skin: Skin, of_wall: Floats) -> Floats:
+    """Return the motions (w, 8) of the lumen beyond the wall, of the wall (u, 8): smooth at necks, then rigid."""
+    inner, balance, of_rim, part, away_mm = skin.beyond
+    smooth, points_mm = balance.solve(of_rim @ of_wall), skin.lumen.vertices_mm[inner]
+    rigid = np.stack([np.bincount(part, column) for column in smooth.T], axis=1) / np.bincount(part)[:, None]
+    off_mm = curves.lengths(_moved_mm(smooth, points_mm) - _moved_mm(rigid[part], points_mm))
+    over_mm = np.full(len(rigid), SOON * skin.width_mm)
+    is_rim = away_mm < SOON * skin.width_mm
+    np.maximum.at(over_mm, part[is_rim], GENTLY * off_mm[is_rim])
+    return np.asarray(smooth + _step(away_mm / over_mm[part])[:, None] * (rigid[part] - smooth))
+
+
+def _unfolded_mm(skin: Skin, of_lumen: Floats, after_mm: Floats) -> Floats:
+    """Return vertices (v, 3) after motions (v, 8), smoothed where a triangle would be turned over."""
+    moves_mm, faces = after_mm - skin.lumen.vertices_mm, skin.lumen.faces
+    of_faces = of_lumen[faces[:, 0], :4]
+    normals = _turned(of_faces / np.linalg.norm(of_faces, axis=1, keepdims=True), skin.lumen.normals)
+    for _ in range(UNFOLDINGS):
+        after = Surface(skin.lumen.vertices_mm + moves_mm, faces)
+        is_turned = np.einsum("fi,fi->f", after.normals, normals) < 0
+        if not is_turned.any():
+            break
+        beside = np.unique(faces[is_turned])
+        moves_mm[beside] = (skin.links[beside] @ moves_mm) / np.asarray(skin.links[beside].sum(axis=1))
+    return np.asarray(skin.lumen.vertices_mm + moves_mm)
 
 
 def _step(x: Floats) -> Floats:

@@ -12,7 +12,7 @@ from vstent.anatomy.restore.paths import on_path
 from vstent.deployment.beam import Beam
 from vstent.deployment.deploy import deploy
 from vstent.deployment.measure import branches
-from vstent.deployment.motion import Motion, moved
+from vstent.deployment.motion import Motion, Skin, moved
 from vstent.devices.stent import Coils, Deployment, Landing, Stent
 from vstent.devices.stiffness import bending_stiffness_N_mm2
 from vstent.devices.treatment import read_straightening
@@ -151,7 +151,7 @@ def straighten(
     first = anatomy.parent.name
     anatomy = on_path(anatomy, stents[0].path)
     rest, yielded, again = artery_beam(anatomy), anatomy, tuple(deployed)
-    moved_mm = rest.rest_mm
+    moved_mm, skin = rest.rest_mm, Skin(anatomy, rest.rest_mm)
     for done in range(ROUNDS):
         ends_mm = min(one.proximal_abscissa_mm for one in stents), max(one.distal_abscissa_mm for one in stents)
         likely, low, high = stiffness = _relative(rest, _device(rest, stents), ends_mm, read_straightening(setting))
@@ -160,8 +160,8 @@ def straighten(
         if np.abs(moved_mm - before_mm).max() < (AGREED_MM if done else np.nextafter(0.0, 1.0)):
             moved_mm = before_mm
             break
-        motion = Motion.of(anatomy, rest.rest_mm, moved_mm)
-        yielded = moved(anatomy, motion)
+        motion = Motion.of(skin, moved_mm)
+        yielded = moved(motion)
         again = _deployed_again(deployed, anatomy, yielded, motion)
         stents = [_on(one.stent, anatomy, yielded) for one in again if not isinstance(one.stent, Coils)]
     shapes = [rest.rest_mm, moved_mm]
