@@ -29,15 +29,16 @@ BED_N_MM2: Final = 0.004
 """Force per length and displacement of the bed, in N/mm2: 0.001 to 0.006, for a beam embedded in tissue 1.4 times the
 modulus of brain, 3 kPa (1 to 4; Budday et al. 2017, Acta Biomater. 48:319)."""
 SETTINGS: Final[dict[str, tuple[float, float, float]]] = {
-    "immediate": (0.278, 0.0574, 0.543),
-    "six_months": (0.586, 0.0, 1.72),
+    "immediate": (0.180, 0.031, 0.383),
+    "six_months": (0.218, 0.0, 0.570),
 }
 """Factor on the stiffness of the device over that of wall and bed, of every named setting: as likely, lowest, highest.
 
-It is fitted to what laser-cut stents straightened, with an Enterprise in the middle of a bend of 90 degrees and 7.1 mm,
-in an artery 3.25 mm wide, the middle of the range for which it is sold. At implantation the radius increased by 3.6 +-
-2.7 mm (24 patients, stents 25.4 mm long; King et al. 2012, AJNR 33:1657). After six months the angle had increased by
-12.9 +- 13.1 degrees (16 patients; Kono et al. 2014, PLoS ONE 9:e108033; an Enterprise of 22 mm is assumed)."""
+It is fitted to what laser-cut stents straightened, with an Enterprise over the neck in seven carotid siphons
+(``benchmarks/straightening.py fit``). At implantation the mean radius of the bend along the stent increased from
+7.1 by 3.6 +- 2.7 mm, by half (24 patients, stents 25.4 mm long; King et al. 2012, AJNR 33:1657). After six months
+the angle had increased by 12.9 +- 13.1 degrees (16 patients; Kono et al. 2014, PLoS ONE 9:e108033; 14 mm long is
+assumed)."""
 OVER_MM: Final = 4.0
 """Length over which directions, and on both sides of a point curvatures are measured, in mm: the width of an artery."""
 STEP_MM: Final = 0.5
