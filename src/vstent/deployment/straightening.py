@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
@@ -89,6 +89,44 @@ class Straightening:
         }
 
 
+class Bend(NamedTuple):
+    """The axis of an artery with devices in it."""
+
+    rest: Beam
+    """The artery without devices."""
+    stiffness_N_mm2: Floats
+    """(3, n) stiffness of the devices relative to that of wall and bed: as likely, lowest and highest."""
+    ends_mm: tuple[float, float]
+    """Where the devices begin and end on the axis."""
+    moved_mm: Floats
+    """(n, 3) nodes in equilibrium."""
+
+    @classmethod
+    def of(
+        cls, rest: Beam, stents: Sequence[Stent], setting: str, place: float = 0.0, start_mm: Floats | None = None
+    ) -> "Bend":
+        """Return the axis with devices in it, from nodes (n, 3); setting and place are those of `straighten`."""
+        ends_mm = min(one.proximal_abscissa_mm for one in stents), max(one.distal_abscissa_mm for one in stents)
+        likely, low, high = stiffness = _relative(rest, _device(rest, stents), ends_mm, read_straightening(setting))
+        at = likely + abs(place) * ((high if place > 0 else low) - likely)
+        return cls(rest, stiffness, ends_mm, settled(rest, at, rest.rest_mm if start_mm is None else start_mm))
+
+    def numbers(self) -> dict[str, Any]:
+        """Return the numbers of `Straightening` by the name of their field."""
+        rest, (likely, *others), moved_mm = self.rest, self.stiffness_N_mm2, self.moved_mm
+        shapes = [rest.rest_mm, moved_mm]
+        shapes += [moved_mm if (one == likely).all() else settled(rest, one, moved_mm) for one in others]
+        angle_rad, radius_mm = np.array([measured(one, self.ends_mm) for one in shapes]).T
+        return {
+            "angle_rad": angle_rad,
+            "radius_mm": radius_mm[:2],
+            "displacement_mm": float(curves.lengths(moved_mm - rest.rest_mm).max()),
+            "axis_length_change_fraction": float(
+                curves.arc_length(moved_mm)[-1] / curves.arc_length(rest.rest_mm)[-1] - 1
+            ),
+        }
+
+
 def described(measures: Mapping[str, Any], intervals: Mapping[str, Mapping[str, float]] = MappingProxyType({})) -> str:
     """Return the metrics of a straightening as sentences; a band that is wider than the effect comes first.
 
@@ -144,38 +182,31 @@ def straighten(
     branches. A device is a beam that is at rest when straight. Every section of the vessel moves with the axis as a
     rigid body, and so does every sac and branch with its neck.
     """
-    stents = [one.stent for one in deployed if one.stent.design.kind in ("braid", "laser_cut")]
-    if len({stent.path for stent in stents}) > 1:
-        raise LandingError("Straightening is computed for devices on one path: leave it out for stents at a fork.")
-    if not stents:
-        raise LandingError("Nothing straightens the artery: coils and devices in sacs have no stiffness along it.")
+    stents = stiff([one.stent for one in deployed])
     first = anatomy.parent.name
     anatomy = on_path(anatomy, stents[0].path)
     rest, yielded, again = artery_beam(anatomy), anatomy, tuple(deployed)
     moved_mm, skin = rest.rest_mm, Skin(anatomy, rest.rest_mm)
     for done in range(ROUNDS):
-        ends_mm = min(one.proximal_abscissa_mm for one in stents), max(one.distal_abscissa_mm for one in stents)
-        likely, low, high = stiffness = _relative(rest, _device(rest, stents), ends_mm, read_straightening(setting))
-        at = likely + abs(place) * ((high if place > 0 else low) - likely)
-        before_mm, moved_mm = moved_mm, settled(rest, at, moved_mm)
-        if np.abs(moved_mm - before_mm).max() < (AGREED_MM if done else np.nextafter(0.0, 1.0)):
-            moved_mm = before_mm
+        bend = Bend.of(rest, stents, setting, place, moved_mm)
+        if np.abs(bend.moved_mm - moved_mm).max() < (AGREED_MM if done else np.nextafter(0.0, 1.0)):
+            bend = bend._replace(moved_mm=moved_mm)
             break
-        motion = Motion.of(skin, moved_mm)
+        moved_mm, motion = bend.moved_mm, Motion.of(skin, bend.moved_mm)
         yielded = moved(motion)
         again = _deployed_again(deployed, anatomy, yielded, motion)
         stents = [_on(one.stent, anatomy, yielded) for one in again if not isinstance(one.stent, Coils)]
-    shapes = [rest.rest_mm, moved_mm]
-    shapes += [moved_mm if (one == likely).all() else settled(rest, one, moved_mm) for one in stiffness[1:]]
-    angle_rad, radius_mm = np.array([measured(one, ends_mm) for one in shapes]).T
-    return Straightening(
-        on_path(yielded, first),
-        again,
-        angle_rad,
-        radius_mm[:2],
-        float(curves.lengths(moved_mm - rest.rest_mm).max()),
-        float(curves.arc_length(moved_mm)[-1] / curves.arc_length(rest.rest_mm)[-1] - 1),
-    )
+    return Straightening(on_path(yielded, first), again, **bend.numbers())
+
+
+def stiff(stents: Sequence[Stent]) -> list[Stent]:
+    """Return the devices that straighten an artery; LandingError is raised for none, and for several paths."""
+    found = [one for one in stents if one.design.kind in ("braid", "laser_cut")]
+    if len({stent.path for stent in found}) > 1:
+        raise LandingError("Straightening is computed for devices on one path: leave it out for stents at a fork.")
+    if not found:
+        raise LandingError("Nothing straightens the artery: coils and devices in sacs have no stiffness along it.")
+    return found
 
 
 def artery_beam(anatomy: Anatomy) -> Beam:
