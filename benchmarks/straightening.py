@@ -32,9 +32,8 @@ from vstent.kernels import curves
 from vstent.phantoms import demo_phantom, phantom_surface
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
-CASES = {"demo": None, "C0038": "aneurisk_C0038.vtp"} | {
-    name: f"aneurisk/{name}.vtp" for name in ("C0005", "C0016", "C0018", "C0024", "C0027", "C0067")
-}
+PATIENTS = "C0038", "C0016", "C0024", "C0067", "C0005", "C0018", "C0027"
+CASES = {name: f"aneurisk/{name}.vtp" for name in PATIENTS} | {"C0038": "aneurisk_C0038.vtp", "demo": None}
 """Sidewall aneurysms of the internal carotid artery, by their file: all in ``../shared/data``."""
 FLOW = FlowSettings(numerics=Numerics(cell_size_mm=0.25))
 PUBLISHED = -23.1, -9.6, -32.6

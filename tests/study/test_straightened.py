@@ -13,6 +13,7 @@ from vstent.errors import InputError
 from vstent.flow.settings import FlowSettings, Numerics
 from vstent.io.writers import write_stl
 from vstent.plan.ranges import Ranges
+from vstent.reporting.scene import scene_of
 from vstent.reporting.uncertainty import uncertainty_of
 from vstent.study.pipeline import run
 from vstent.study.settings import Settings
@@ -69,6 +70,13 @@ def test_both_effects_have_their_flow(source: Path, tmp_path: Path) -> None:
     ratio = "mean_sac_velocity_m_s_ratio"
     assert len({treatment["change"][ratio], alone[ratio], both[ratio]}) == 3
     assert set(found.fields) == {"bare", "enterprise"}
+    scene = scene_of(found.anatomy, found.implants, found.shown, found.yielded)
+    for pane, anatomy in (("bare", found.anatomy), ("enterprise", found.yielded["enterprise"].anatomy)):
+        (lumen,) = scene.pick(("lumen",), pane)
+        assert anatomy.vessel.lumen.closest(lumen.vertices_mm)[1].max() < 0.02
+        (lines,) = scene.pick(("streamlines",), pane)
+        assert anatomy.vessel.lumen.closed.signed_distance(lines.vertices_mm).max() < 0.3
+    assert [title for _, title in scene.panes][1].endswith(", artery straightened")
     (note,) = [note for note in found.notes if note.startswith("Straightening, enterprise: ")]
     assert note.endswith(f" {alone[ratio] - 1:+.0%} by straightening, {both[ratio] - 1:+.0%} by both.")
     for part in ("flow", "straightened/flow", "straightened/bare/flow"):
