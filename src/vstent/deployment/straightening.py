@@ -41,6 +41,8 @@ the angle had increased by 12.9 +- 13.1 degrees (16 patients; Kono et al. 2014, 
 assumed)."""
 OVER_MM: Final = 4.0
 """Length over which directions, and on both sides of a point curvatures are measured, in mm: the width of an artery."""
+STRAIGHT_PER_MM: Final = 1e-4
+"""Curvature of an artery that is straight, in 1/mm: no radius is larger than 10 m."""
 STEP_MM: Final = 0.5
 """Length of a piece of the beam, in mm."""
 AGREED_MM: Final = 0.05
@@ -250,7 +252,7 @@ def measured(nodes_mm: Floats, ends_mm: tuple[float, float]) -> tuple[float, flo
     turn_rad = np.arctan2(np.linalg.norm(np.cross(first, last)), first @ last)
     curvature = curves.curvature_and_torsion(nodes_mm, OVER_MM)[0]
     is_along = (where_mm >= ends_mm[0]) & (where_mm <= ends_mm[1])
-    return float(np.pi - turn_rad), float(1 / curvature[is_along].max())
+    return float(np.pi - turn_rad), float(1 / max(curvature[is_along].max(), STRAIGHT_PER_MM))
 
 
 def _bending_N_mm2(radius_mm: Floats | float) -> Floats:
