@@ -13,6 +13,7 @@ from vstent.errors import InputError
 from vstent.flow.settings import FlowSettings, Numerics
 from vstent.io.writers import write_stl
 from vstent.plan.ranges import Ranges
+from vstent.reporting.quality import qualities
 from vstent.reporting.scene import scene_of
 from vstent.reporting.uncertainty import uncertainty_of
 from vstent.study.pipeline import run
@@ -69,6 +70,12 @@ def test_both_effects_have_their_flow(source: Path, tmp_path: Path) -> None:
     alone, both = treatment["straightening"]["bare"]["change"], treatment["straightening"]["change"]
     ratio = "mean_sac_velocity_m_s_ratio"
     assert len({treatment["change"][ratio], alone[ratio], both[ratio]}) == 3
+    for part in (treatment["straightening"], treatment["straightening"]["bare"]):
+        assert part["quality"]["grade"] == treatment["quality"]["grade"] == "not usable"  # of so coarse a grid
+        assert part["quality"]["cells_across_parent_count"] == pytest.approx(7.5, abs=0.5)
+    titles = [one.title for one in qualities(found.metrics, {"enterprise": "Enterprise"})]
+    assert "Grid and convergence with Enterprise in the straightened artery" in titles
+    assert "not usable: use a finer grid" in found.notes[0]
     assert set(found.fields) == {"bare", "enterprise"}
     scene = scene_of(found.anatomy, found.implants, found.shown, found.yielded)
     for pane, anatomy in (("bare", found.anatomy), ("enterprise", found.yielded["enterprise"].anatomy)):

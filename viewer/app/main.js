@@ -437,7 +437,8 @@ class Page {
     return names.map((name) => {
       const i = sheet?.names.indexOf(name) ?? -1;
       const said = i < 0 ? row?.cells[0] : `${row?.cells[1 + 2 * i]} (${row?.cells[2 + 2 * i]})`;
-      const note = row && (i >= 0 || name === "bare") ? `${row.name} ${said}` : "";
+      const isYielded = this.picture.isMoved(name); // the numbers of the table are those in the artery as scanned
+      const note = isYielded ? "Artery straightened" : row && (i >= 0 || name === "bare") ? `${row.name} ${said}` : "";
       return { id: name, title: name === "bare" ? "Before (no device)" : this.names.treatment(name), note };
     });
   }

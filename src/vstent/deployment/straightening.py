@@ -205,7 +205,10 @@ def stiff(stents: Sequence[Stent]) -> list[Stent]:
     """Return the devices that straighten an artery; LandingError is raised for none, and for several paths."""
     found = [one for one in stents if one.design.kind in ("braid", "laser_cut")]
     if len({stent.path for stent in found}) > 1:
-        raise LandingError("Straightening is computed for devices on one path: leave it out for stents at a fork.")
+        raise LandingError(
+            "Straightening is computed for devices on one path: at a fork each device pulls the artery towards its own "
+            "branch, and the balance of both is not modelled."
+        )
     if not found:
         raise LandingError("Nothing straightens the artery: coils and devices in sacs have no stiffness along it.")
     return found
