@@ -393,6 +393,7 @@ class Preview:
             views=[view_of("profile", profile.axes, treated, 1.15), whole, *others],
             fade=1.2 * float(np.median(radius_mm)),
             axis=_axis(axis.points_mm, axis.abscissa_mm) | {"diameter": np.round(2 * radius_mm, 3).tolist()},
+            own_mm=anatomy.parent.own_mm,
             is_oriented=anatomy.vessel.is_oriented,
             openings=[
                 {

@@ -57,9 +57,11 @@ class Row(NamedTuple):
 
 
 def number_name(name: str) -> str:
-    """Return the display name of a number of the catalogue; further groups of wires have their number."""
+    """Return the display name of a number of the catalogue; further groups of wires are counted."""
     group = re.fullmatch(r"wire_(\d+)_(\w+)", name)
-    return f"{NUMBERS[f'wire_{group[2]}']} of wire kind {group[1]}" if group else NUMBERS.get(name, name)
+    if group is None:
+        return NUMBERS.get(name, name)
+    return f"{NUMBERS[f'wire_{group[2]}']} of the {('second', 'third', 'fourth')[int(group[1]) - 2]} kind of wire"
 
 
 def band_rows(implant: Mapping[str, Any]) -> list[Row]:
