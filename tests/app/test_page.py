@@ -309,7 +309,7 @@ def test_deployed_numbers_are_those_of_the_measures(client, case, workspace):
     lengths = next(row for row in sheet["rows"] if row[0] == "Deployed length")
     low, value, high = (float(lengths[k].split("\u202f")[0]) for k in (2, 1, 3))
     assert low < value < high
-    assert "Sources of the numbers of Silk: 2 cited" in sheet["sentence"]
+    assert "Silk is described by 5 numbers: 2 cited" in sheet["sentence"]
     with_gaps = client.post(f"{case}/bands?gaps=true", json=wanted(silk), timeout=300).json()
     assert [row for row in with_gaps["rows"] if row in sheet["rows"]] == sheet["rows"]
     assert len(with_gaps["rows"]) == len(sheet["rows"]) + 2
@@ -786,10 +786,12 @@ def test_flows_of_other_settings_are_not_taken_for_those_of_the_results(flown, t
         view = client.get(case).json()
         assert view["has_flow"]
         assert set(view["steps"].values()) == {"done"}
-        # A study with another inflow was stopped after its first flow: the flow of the results is there no more.
+        # Studies with other inflows were stopped after their first flow: after three, that of the results is gone.
         settings = settings_of(told["settings"])
-        other = replace(settings, flow=replace(settings.flow, inflow_mL_s=3.0))
-        keep_flow(folder, told["input"]["sha256"], other, "bare")
+        for inflow_mL_s in (3.0, 4.0, 5.0):
+            assert client.get(case).json()["has_flow"]
+            other = replace(settings, flow=replace(settings.flow, inflow_mL_s=inflow_mL_s))
+            keep_flow(folder, told["input"]["sha256"], other, "bare")
         view = client.get(case).json()
         assert not view["has_flow"]
         assert (view["steps"]["flow"], view["steps"]["report"]) == ("todo", "done")
@@ -800,6 +802,22 @@ def test_flows_of_other_settings_are_not_taken_for_those_of_the_results(flown, t
     with app_case.served(tmp_path / "others", folder) as client:
         (listed,) = client.get("/api/cases").json()["cases"]
         assert listed["done"] == list(STEPS[:5])
+
+
+def test_going_back_to_former_settings_shows_their_stored_flows(flown, tmp_path):
+    folder, told = flown
+    settings = settings_of(told["settings"])
+    other = replace(settings, flow=replace(settings.flow, inflow_mL_s=3.0))
+    for name in ("bare", "silk"):
+        keep_flow(folder, told["input"]["sha256"], other, name)
+    written = {path: path.stat().st_mtime_ns for path in (folder / CACHE).glob("flow *")}
+    with app_case.served(tmp_path / "cases", folder) as client:
+        case = f"/api/cases/{client.get('/api/cases').json()['opened']}"
+        flow = client.get(case).json()["choices"]["flow"]
+        assert choose(client, case, flow=flow | {"inflow_mL_s": 2.0}).json()["job"] is None  # never computed
+        assert choose(client, case, flow=flow | {"inflow_mL_s": 3.0}).json()["job"]["kind"] == "flow"
+        client.delete(f"{case}/jobs")
+    assert {path: path.stat().st_mtime_ns for path in (folder / CACHE).glob("flow *")} == written
 
 
 def test_what_cannot_be_chosen_on_the_page_stays_as_the_study_had_it(flown, tmp_path):

@@ -143,7 +143,7 @@ def test_two_bends_in_opposite_directions_crumple_cells_and_the_advice_says_wher
     said = f" {count} of its 72 cells are crumpled, the narrowest to {measures['min_cell_width_fraction']:.0%} of the"
     assert said in done.advice
     assert f"{measures['narrowest_cell_abscissa_mm']:.1f} mm from the inlet" in done.advice
-    assert done.advice.count("Braided devices follow bends better.") == 1
+    assert done.advice.count("Move it along the artery.") == 1
     braid = deployed(PIPELINE, siphon())
     assert measure(siphon(), braid)["min_cell_width_fraction"] > 0.6
     assert "crumpled" not in braid.advice

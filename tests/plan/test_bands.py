@@ -167,7 +167,7 @@ def test_bands_are_told_in_words_with_their_largest_cause():
     assert number_name(next(iter(band.shares))) in length.cause
     assert f"(mostly the {number_name(next(iter(band.shares)))})" in how_sure(told)
     assert ends(told, "apposed_fraction") == ""  # it lies on the wall whatever its numbers are
-    assert number_name("wire_2_diameter_um") == "wire diameter of wire kind 2"
+    assert number_name("wire_2_diameter_um") == "wire diameter of the second kind of wire"
 
 
 def test_the_numbers_of_a_device_are_told_once_where_two_implants_are_of_it():

@@ -1,5 +1,5 @@
 // The page: seven steps from a scan to a report, the scene in the middle, the numbers beside it.
-import { button, make } from "../src/dom.js";
+import { button, make, spoken } from "../src/dom.js";
 import { drop, get, getBinary, Newest, post, put } from "./api.js";
 import { Axis } from "./axis.js";
 import { inWords } from "./carm.js";
@@ -32,7 +32,7 @@ export const STEPS = [
   ["report", "Report"],
 ];
 const SIGNS = { todo: "", running: "", done: "✓", stale: "↻", failed: "!" };
-const WORDS = { todo: "not done yet", running: "at work", done: "done", stale: "out of date: something before it has changed", failed: "failed" };
+const WORDS = { todo: "not done yet", running: "at work", done: "done", stale: "out of date: something before it has changed", failed: "needs your attention" };
 
 class Page {
   constructor(root) {
@@ -270,6 +270,7 @@ class Page {
     try {
       const answer = await getBinary(`${this.path}/anatomy`);
       this.anatomy = answer.manifest;
+      this.continuedMarks = undefined;
       this.picture.stage?.drop(({ id }) => id === "input" || id.startsWith("opening ") || ["lumen", "landing", "continued", "sac", "neck", "wires", "contour"].includes(id));
       this.picture.put(answer);
       this.neck.given = null; // its curve is drawn anew over the one found
@@ -296,6 +297,7 @@ class Page {
       this.sheets = sheets;
       this.flowPanes = answer.manifest.panes;
       this.times = answer.manifest.times_s;
+      for (const pane of this.flowPanes) if (this.picture.isMoved(pane)) this.picture.dropMoved(pane, ["wires", "contour"]);
       this.picture.put(answer);
       this.render();
     } catch (problem) {
@@ -405,10 +407,18 @@ class Page {
       this.neck.set(this.view.choices.neck_mm ?? curve_mm, handles);
       const choose = (opening) => opening.role !== "inlet" && this.choose({ outlet_mm: placeOf(opening) });
       const outlets = this.openingMarks(choose, "Click to let the parent artery lead here", "opening name");
-      return [...this.neck.handles, ...outlets, ...this.sacMarks()];
+      return [...this.neck.handles, ...outlets, ...this.sacMarks(), ...this.assumedMarks];
     }
-    if (this.step === "device" && !this.isComparing) return this.sacMarks();
-    return this.step === "deploy" && this.treatment && !this.asksForAneurysm ? [...this.deploying.handles, this.deploying.cursorMark] : [];
+    if (this.step === "device" && !this.isComparing) return [...this.sacMarks(), ...this.assumedMarks];
+    return this.step === "deploy" && this.treatment && !this.asksForAneurysm ? [...this.deploying.handles, this.deploying.cursorMark, ...this.assumedMarks] : [];
+  }
+
+  /** Names of the rings with which the artery is continued beyond its ends. */
+  get assumedMarks() {
+    const [first, last] = this.anatomy.own_mm;
+    const ends = [first, this.axis.length + last].filter((mm) => mm > 0.1 && mm < 2 * this.axis.length - 0.1);
+    const words = () => make("span", { className: "opening scene-label", title: "The artery ends here: its continuation, with a constant diameter, is assumed" }, [make("b", {}, ["Assumed"])]);
+    return (this.continuedMarks ??= ends.map((mm) => ({ element: words(), isLabel: true, point: () => this.picture.shown.has("continued") && this.axis.at(mm / 2) })));
   }
 
   /** Whether no aneurysm was found, and the user has not said where it is or that there is none. */
@@ -436,7 +446,8 @@ class Page {
     return names.map((name) => {
       const i = sheet?.names.indexOf(name) ?? -1;
       const said = i < 0 ? row?.cells[0] : `${row?.cells[1 + 2 * i]} (${row?.cells[2 + 2 * i]})`;
-      const note = row && (i >= 0 || name === "bare") ? `${row.name} ${said}` : "";
+      const isYielded = this.picture.isMoved(name); // the numbers of the table are those in the artery as scanned
+      const note = isYielded ? "Artery straightened" : row && (i >= 0 || name === "bare") ? `${row.name} ${said}` : "";
       return { id: name, title: name === "bare" ? "Before (no device)" : this.names.treatment(name), note };
     });
   }
@@ -465,8 +476,8 @@ class Page {
   renderDeploy() {
     const { treatment, implant } = this;
     if (!treatment || this.asksForAneurysm) return;
-    this.picture.moved = (event) => this.deploying.look(this.axis.under(event, null));
-    const key = JSON.stringify([treatment, implant.id, this.colour, this.view.anatomy, this.view.job?.kind === "place"]);
+    this.picture.moved = (event) => this.deploying.look(this.deploying.line.under(event, null));
+    const key = JSON.stringify([treatment, implant.id, this.colour, this.view.anatomy, this.view.choices.straightening, this.view.job?.kind === "place"]);
     if (this.shownTreatment !== key || !this.measures[treatment.name]) {
       this.shownTreatment = key;
       this.deploying.show(treatment.name, implant.id);
@@ -510,9 +521,9 @@ class Page {
     this.work.hidden = !job;
     if (!job) return this.work.replaceChildren();
     const bar = make("i", { style: { width: `${Math.max(2, 100 * job.fraction)}%` } });
-    const words = make("div", { className: "work-words" }, [make("b", {}, [job.stage ? this.spoken(job.stage) : "Starting"]), make("span", {}, [progressWords(job) || "…"])]);
+    const words = make("div", { className: "work-words" }, [make("b", {}, [job.stage ? this.stageWords(job.stage) : "Starting"]), make("span", {}, [progressWords(job) || "…"])]);
     const stop = button("Cancel", () => drop(`${this.path}/jobs`).catch(this.complain));
-    const done = job.finished.map(({ stage }) => this.spoken(stage));
+    const done = job.finished.map(({ stage }) => this.stageWords(stage));
     const said = make("p", { className: "hint" }, [done.length ? `Done: ${done.join(", ")}.` : "The work continues when this tab is closed."]);
     redraw(this.work, words, make("div", { className: "bar", role: "progressbar", ariaLabel: "Progress of the work", ariaValueNow: String(Math.round(100 * job.fraction)) }, [bar]), stop, said);
   }
@@ -551,16 +562,18 @@ class Page {
       this.measures[manifest.treatment] = manifest.measures.map((sheet) => ({ ...sheet, rows: low && (sheet.title === manifest.title || manifest.measures.length === 1) ? [...sheet.rows, range] : sheet.rows }));
       this.advice = manifest.advice;
       const missing = manifest.is_placed ? null : manifest.treatment; // whose coils are not placed yet
-      const isNew = missing !== this.missing;
-      this.missing = missing;
+      const isNew = missing !== this.missing || manifest.size !== this.size;
+      [this.missing, this.size] = [missing, manifest.size];
       if (isNew) this.render();
       this.renderNumbers();
       this.portrait.take(`${manifest.treatment} ${JSON.stringify(manifest.ends_mm)}`);
-      this.panel.querySelector(".advice")?.replaceChildren(manifest.advice);
-      if (this.deploying.cursor === undefined && this.anatomy.neck.length) this.deploying.look((this.anatomy.neck[0] + this.anatomy.neck[1]) / 2);
+      this.panel.querySelector(".advice")?.replaceChildren(spoken(manifest.advice));
+      const [first, last] = this.anatomy.neck.length ? this.anatomy.neck : (manifest.ends_mm ?? []);
+      if (this.deploying.cursor === undefined) this.deploying.look((first + last) / 2);
       else this.deploying.look(this.deploying.cursor);
     }
     this.panel.querySelector(".place")?.replaceChildren(...placeWords(manifest, this.bands, this.anatomy.neck));
+    this.panel.querySelector(".yielding")?.replaceChildren(manifest.straightening ?? "");
   }
 
   /** The bands of the device that lies still; null while it is dragged. */
@@ -573,7 +586,7 @@ class Page {
   }
 
   /** A stage of a job in words: ``flow silk``, ``deploy silk+silk_2 silk_2``. */
-  spoken(stage) {
+  stageWords(stage) {
     const [first, name, id] = stage.split(" ");
     const words = SPOKEN[first] || stage;
     if (!name || first === "plan") return words;
@@ -756,7 +769,7 @@ const LAYERS = {
   flow: (page) => {
     const mode = page.memory.mode || "streamlines";
     const modes = ["streamlines", "slice", "shear", "sac_shear"].map((id) => ({ id, on: mode === id }));
-    return [{ ...LUMEN, on: mode !== "shear" }, ...modes, { id: "wires", title: "Wires", on: false }, { id: "straightened", title: "Straightened", on: true }, NECK];
+    return [{ ...LUMEN, on: mode !== "shear" }, ...modes, { id: "wires", title: "Wires", on: false }, NECK];
   },
   report: (page) => LAYERS.flow(page),
 };

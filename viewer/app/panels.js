@@ -139,7 +139,7 @@ export const panels = {
   },
 
   vessel(page) {
-    const parts = [...title("Vessel", "Blood enters through the inlet: click another opening to change it, tick those that bring blood as well. Drag the handles on the artery to keep less of it.")];
+    const parts = [...title("Vessel", `Blood enters through the inlet: click another opening to change it, tick those that bring blood as well.${page.anatomy?.neck.length ? " Drag the handles on the artery to keep less of it." : ""}`)];
     if (page.anatomy) parts.push(openings(page));
     if (page.anatomy?.neck.length) parts.push(...kept(page));
     parts.push(...point(page, "inlet_mm", "Inlet near"), ...state(page), ...notes(page));
@@ -187,7 +187,9 @@ export const panels = {
     if (page.missing === treatment.name && !page.view.job) parts.push(main("Place the coils", () => page.start("place"), !page.view.has_anatomy));
     const colour = "Colour of the wires";
     parts.push(
-      make("div", { className: "place" }, isHere(page.place) ? placeWords(page.place, isHere(page.bands) ? page.bands : null, page.anatomy.neck) : []),
+      make("div", { className: "place" }, isHere(page.place) ? placeWords(page.place, isHere(page.bands) ? page.bands : null, page.anatomy.neck) : [make("p", { className: "hint", role: "status" }, ["The device is being deployed …"])]),
+      select("straightening", "Artery", page.view.choices.straightening, STRAIGHTENINGS, (value) => page.choose({ straightening: value })),
+      make("p", { className: "hint yielding" }, [isHere(page.place) ? (page.place.straightening ?? "") : ""]),
       make("div", { className: "bands" }, isHere(page.bands) ? bandWords(page.bands) : []),
       make("div", { className: "label" }, [colour]),
       tabs(colour, page.colour, [["wall_gap", "Wall gap"], ["coverage", "Coverage"], ["diameter", "Diameter"]], (id) => page.show({ colour: id })),

@@ -78,7 +78,18 @@ export class Picture {
     this.stage.put(manifest, buffer);
     if (manifest.fade) this.stage.shared.fade = manifest.fade;
     if ("is_oriented" in manifest) this.stage.isOriented = manifest.is_oriented;
+    this.renderTools(); // a layer that there was not before is offered
     this.apply();
+  }
+
+  /** Whether a pane has the wall of an artery that has yielded to its devices. */
+  isMoved(pane) {
+    return this.stage?.layers.some((layer) => layer.id === "lumen" && layer.pane === pane);
+  }
+
+  /** Take away what has moved in a pane with its devices, so that it shows the artery as scanned. */
+  dropMoved(pane, more = []) {
+    this.stage?.drop((layer) => layer.pane === pane && ["lumen", "neck", "axis", ...more].includes(layer.id));
   }
 
   /** Offer the views of what is shown, a scan or a vessel; the other one than before is looked at anew. */
@@ -113,7 +124,7 @@ export class Picture {
 
   renderTools() {
     const layers = this.switches
-      .filter(({ title }) => title)
+      .filter(({ title, id, also = [] }) => title && this.layersSeen((name) => name === id || also.includes(name)).length)
       .map(({ id, title, also = [] }) => {
         const turn = () => {
           const on = !this.shown.has(id);
@@ -214,14 +225,14 @@ export class Picture {
     return button(stage.ranges[scale.id] ? "range (own)" : "range", change, { className: "link range", title: "Change the range of these colours", ariaLabel: `Range of ${scale.title}` });
   }
 
+  /** The layers of the panes whose names are wanted. */
+  layersSeen(isWanted) {
+    return this.stage?.layers.filter(({ id, pane }) => isWanted(id) && (pane === "" || this.panes.some((one) => one.id === pane))) ?? [];
+  }
+
   /** The colour scales of what is seen. */
   scalesShown() {
-    const panes = new Set(this.panes.map(({ id }) => id));
-    const used = new Set(
-      this.stage.layers
-        .filter((layer) => this.shown.has(layer.id) && (layer.pane === "" || panes.has(layer.pane)))
-        .map((layer) => layer.scale),
-    );
+    const used = new Set(this.layersSeen((id) => this.shown.has(id)).map(({ scale }) => scale));
     return Object.values(this.stage.scales).filter((scale) => used.has(scale.id));
   }
 
@@ -321,6 +332,9 @@ export class Picture {
     this.drawnMarks.forEach((mark) => this.placeMark(mark));
     const [width, height, top] = [this.area.clientWidth, this.area.clientHeight, this.toolbar.offsetHeight + 28];
     const taken = [];
+    const near = this.drawnMarks.filter(({ element }) => element.matches(".handle:not(.small, .cut)") && !element.hidden).sort((a, b) => a.at[0] - b.at[0]);
+    if (near.length === 2 && near[1].at[0] - near[0].at[0] < 180 && Math.abs(near[1].at[1] - near[0].at[1]) < 28) near.forEach(({ element }, i) => element.classList.toggle("flipped", !i)); // words on either side
+    for (const { element, at, isLabel } of this.drawnMarks) element.hidden ||= Boolean(isLabel) && (at[0] < 0 || at[0] > width || at[1] < 0 || at[1] > height);
     const labels = this.drawnMarks.filter(({ isLabel, element }) => isLabel && !element.hidden);
     for (const mark of labels.sort((a, b) => a.at[1] - b.at[1])) {
       const { offsetWidth: w, offsetHeight: h } = mark.element;

@@ -66,6 +66,18 @@ def lost_steps(folder: Path, state: State) -> set[str]:
     return lost
 
 
+def are_flows_stored(folder: Path, state: State) -> bool:
+    """Return whether all flows of the present choices were computed before the last study, which had others."""
+    done, keys = state.done, dependencies(state)
+    if not state.choices.flow.is_wanted or done.get("sac") != keys["sac"] or done.get("flow") in (None, keys["flow"]):
+        return False
+    try:
+        paths = _flows_wanted(folder, _given(state)).values()
+    except InputError:
+        return False
+    return all(path.with_suffix(".json").is_file() for path in paths)
+
+
 def _given(state: State) -> str:
     """Return what the flows of a case depend on, as JSON."""
     return state.model_dump_json(include={"name", "source", "former", "choices"})

@@ -193,17 +193,17 @@ def _add_cases(api: APIRouter, work: Workspace, of_case: Any) -> None:
     @api.put("/api/cases/{case_id}/choices", summary="Change choices; 409 where the case was changed elsewhere")
     def choose(change: Change, case: Case = of_case) -> dict[str, Any]:
         case.change(change.revision, change.choices)
-        return work.view(case)
+        return work.changed(case)
 
     @api.post("/api/cases/{case_id}/undo", summary="Undo the last change")
     def undo(seen: Seen, case: Case = of_case) -> dict[str, Any]:
         case.step_back(seen.revision)
-        return work.view(case)
+        return work.changed(case)
 
     @api.post("/api/cases/{case_id}/redo", summary="Redo the last undone change")
     def redo(seen: Seen, case: Case = of_case) -> dict[str, Any]:
         case.step_back(seen.revision, forward=True)
-        return work.view(case)
+        return work.changed(case)
 
     @api.get("/api/cases/{case_id}/events", summary="The state, sent again whenever it changes (server-sent events)")
     async def events(case: Case = of_case) -> StreamingResponse:

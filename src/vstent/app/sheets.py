@@ -74,7 +74,8 @@ def flow(metrics: dict[str, Any], titles: dict[str, str]) -> list[Sheet]:
         cells, senses = [change.before.text], []
         for name in titles:
             after = change.after.get(name)
-            cells += [after.text, change.of(name)] if after else ["–", "–"]
+            of = "not usable" if name in change.hidden else change.of(name)
+            cells += [after.text, of] if after else ["–", "–"]
             senses.append(change.sense(name) if after else "")
         row = _row(change.before, cells, is_first=change.before.key in HEADLINES)
         rows.append(row | {"senses": senses})

@@ -10,7 +10,7 @@ from typing import Any, Final
 from vstent.app import intake
 from vstent.app.cases import STATE, STEPS, Case, Cases, dependencies, failures, statuses
 from vstent.app.choices import pulse_of
-from vstent.app.finished import REPORT, RUN, kept_histories, lost_steps, reopened, shown_flows
+from vstent.app.finished import REPORT, RUN, are_flows_stored, kept_histories, lost_steps, reopened, shown_flows
 from vstent.app.jobs import KINDS, RANKING, Jobs
 from vstent.devices.treatment import BARE, Treatment
 from vstent.errors import InputError, ReadError
@@ -117,6 +117,12 @@ class Workspace:
             "has_angiogram": bool(kept_histories(case.folder)),
             "job": job.told() if job else None,
         }
+
+    def changed(self, case: Case) -> dict[str, Any]:
+        """Return the state after a change of the choices; those of an earlier run get its stored flows and a report."""
+        if self.jobs.running(case) is None and are_flows_stored(case.folder, case.state):
+            self.start(case, "flow")
+        return self.view(case)
 
     def demo(self) -> Case:
         """Create a case of the synthetic scan."""

@@ -24,8 +24,6 @@ SHORT_MM: Final = 0.1
 """Length, in mm, by which the margin beyond the neck may be missed, since the deployed length is only estimated."""
 OFF_MM: Final = 0.5
 """Distance from the parent artery, in mm, beyond which a neck also opens into another branch."""
-BRAIDED: Final = "Braided devices follow bends better."
-"""Remedy for a device whose struts cannot follow a bend."""
 
 
 def advise(anatomy: Anatomy, stent: Stent, course: Course, gap_mm: Floats, is_at_patient: Bools) -> str:
@@ -55,8 +53,7 @@ def advise(anatomy: Anatomy, stent: Stent, course: Course, gap_mm: Floats, is_at
         count = f"{cells.crumpled_count} of its {cells.cells_count} cells"
         width = f"{max(cells.narrowest_fraction, 0.0):.0%} of the width in a straight artery"
         lies += f" {count} {'is' if cells.crumpled_count == 1 else 'are'} crumpled, the narrowest to {width}, "
-        remedy = "Move it along the artery." if stent.design.follows_bends else BRAIDED
-        lies = f"{lies}{place_of_narrowest(anatomy, cells)}.{'' if BRAIDED in lies else f' {remedy}'}"
+        lies += f"{place_of_narrowest(anatomy, cells)}. Move it along the artery."
     first_mm, last_mm = anatomy.parent.own_mm
     beyond_mm = {"proximal": first_mm - stent.proximal_abscissa_mm, "distal": stent.distal_abscissa_mm - last_mm}
     parts = [f"{length:.1f} mm at its {end} end" for end, length in beyond_mm.items() if length > SHORT_MM]
@@ -118,7 +115,7 @@ def _remedy(anatomy: Anatomy, stent: Stent, gap_mm: Floats, is_loose: Bools) -> 
     """Return why nodes have gaps `gap_mm` (rows, columns) to the wall, and what to do."""
     could_open = stent.row_diameter_mm + 2 * gap_mm.mean(axis=1) < free_diameters_mm(stent.design, stent.size)
     if not stent.design.follows_bends and is_loose[could_open].sum() > 0.5 * is_loose.sum():
-        return f"its struts keep their length, and the way around the outside of the bend is longer. {BRAIDED}"
+        return "its struts keep their length, and the way around the outside of the bend is longer."
     its = f"its free diameter is {stent.size.free_diameter_mm:.2f} mm"
     wider = [size for size in stent.design.sizes if size.diameter_mm > stent.size.diameter_mm]
     if not wider:

@@ -58,4 +58,8 @@ def how_sure(design: Design) -> str:
     """Return one sentence on how well the numbers of a device are known."""
     levels = Counter(fact.confidence for fact in design.facts)
     counted = ", ".join(f"{levels[level]} {level}" for level in ("cited", "derived", "estimated") if levels[level])
-    return f"Sources of the numbers of {design.name}: {counted}." if counted else f"{design.name} has no sources."
+    return (
+        f"{design.name} is described by {len(design.facts)} numbers: {counted}."
+        if counted
+        else f"{design.name} has no sources."
+    )

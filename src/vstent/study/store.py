@@ -2,7 +2,8 @@
 
 A result lies in the cache folder under its name and its `Key`. ``NAME-KEY.json`` is its record: the run time of every
 stage that it took, and its values if they are plain. ``NAME-KEY.npz`` holds a data class. The record is written last,
-so a result with a record is complete. Older results of a name are deleted after that.
+so a result with a record is complete. Older results of its name are deleted after that, except the latest flows of the
+same code: a study that goes back to former settings finds them.
 
 This module imports no numerical library, so that `vstent.cli.finished` can answer at once.
 """
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     from vstent.flow.engines import Saved
 
 Result = TypeVar("Result")
+KEPT: Final = 3
+"""Number of flows of one name that are kept."""
 KEY_DIGITS: Final = 12
 """Number of hexadecimal digits of each part of a key."""
 UNREADABLE: Final = (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError)
@@ -135,7 +138,7 @@ class Store:
         return None
 
     def save(self, name: str, key: Key, result: Any) -> None:
-        """Store a result under a key; older results of the same name are deleted after that."""
+        """Store a result under a key; older results of the same name are deleted as in `write`."""
         self.saver(name, key, result)()
 
     def saver(self, name: str, key: Key, result: Any) -> Callable[[], None]:
@@ -210,12 +213,17 @@ class Store:
     def write(self, name: str, key: Key, seconds: Mapping[str, float], **more: Any) -> None:
         """Write the record of a result, with which it is complete, and delete older results of the same name.
 
-        It states the run time of every stage that the result took, and values or states of files.
+        The latest flows by the same code are kept. The record states the run time of every stage that the result took,
+        and values or states of files.
         """
         with atomic(self.path(name, key, ".json")) as partial_file:
             partial_file.write_text(json.dumps({"seconds": seconds} | more), encoding="utf-8")
-        for file in self._files(name):
-            if not file.name.startswith(f"{name}-{key}."):
+        files = self._files(name)
+        alike = [file for file in files if file.name.endswith(f"-{key.code}.json") and name.startswith("flow ")]
+        alike.sort(key=lambda file: file.stat().st_mtime_ns)
+        kept = {self.path(name, key).stem, *(file.stem for file in alike[-KEPT:])}
+        for file in files:
+            if not any(file.name.startswith(f"{stem}.") for stem in kept):
                 with suppress(OSError):
                     file.unlink()
 
