@@ -21,7 +21,8 @@ The same flow rate has velocities on both grids that differ by some thousandths,
 differently. Blood that is set anew in each exchange would have to be accelerated by that between two of them: a border
 across a tube of six coarse cells would take the pressure that falls over two cells. Momentum normal to the border is
 therefore added to the cells that are set. It is integrated from what remains: on the coarser grid the mass that crosses
-too much, on the finer one the difference of pressure between both grids in the layer between.
+too much, on the finer one the difference of pressure between both grids in the layer between. It is bounded
+(`MOST_PUSHED`), because wires that cross a border keep such a difference.
 """
 
 from dataclasses import dataclass, replace
