@@ -322,7 +322,7 @@ def test_a_run_with_levels_is_given_a_third_of_the_steps() -> None:
         engine.init(replace(case, numerics=replace(case.numerics, close_up=close_up)), None)
         for close_up in (False, True)
     )
-    assert engine.max_checks(near) == int(case.numerics.max_steps / 3 // near.finest.steps_per_check) >= 12
+    assert engine.max_checks(near) == int(case.numerics.max_steps / 3 // near.main.steps_per_check) >= 12
     assert engine.max_checks(whole) == int(case.numerics.max_steps // whole.steps_per_check)
 
 
