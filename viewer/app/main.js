@@ -533,7 +533,8 @@ class Page {
     const flow = this.sheets?.flow?.[0];
     if (["flow", "report"].includes(this.step) && flow) {
       const stale = this.view.steps.flow === "stale" ? [make("p", { className: "note stale" }, ["Settings have changed since this flow was computed: run the step Flow again."])] : [];
-      parts.push(head("Before and after"), ...stale, changeSheet(flow, this.isWhole, (name) => this.names.treatment(name)), qualitySheet(flow));
+      const both = [changeSheet(flow, this.isWhole, (name) => this.names.treatment(name)), qualitySheet(flow)];
+      parts.push(head("Before and after"), ...stale, ...(flow.qualities.some(({ grade }) => grade === "not usable") ? both.reverse() : both));
       if (this.sheets.ranking?.length) parts.push(...rankedSheet(this.sheets.ranking, (name) => this.names.treatment(name)));
     }
     if (this.isComparing) parts.push(head("Compared"), plainSheet(this.ranking.comparing.sheets(), this.isWhole));
