@@ -116,7 +116,7 @@ def study_keys(source: str, settings: "Settings") -> dict[str, Key]:
             if len(treatment.implants) == 1:
                 (key,), (device,) = deployed[treatment.name].values(), treatment.devices
                 numbers = settings.uncertainty.numbers_of(find_design(device))
-                varied = key, settings.uncertainty, numbers, flow
+                varied = key, settings.uncertainty, numbers, flow, settings.straightening
                 keys[f"vary {treatment.name}"] = key_of("vstent.plan.uncertainty", *varied, without=unused)
     return keys
 
