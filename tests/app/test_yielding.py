@@ -52,7 +52,7 @@ def layers_of(answer, pane):
     return layers, told
 
 
-def test_a_drag_redraws_the_artery_and_the_device_in_it(study, found, tmp_path):
+def test_a_drag_redraws_the_artery_and_the_device_in_it(study, found, tmp_path, monkeypatch):
     scanned, yielded = found
     with app_case.served(tmp_path, study) as client:
         case = f"/api/cases/{client.get('/api/cases').json()['opened']}"
@@ -72,6 +72,10 @@ def test_a_drag_redraws_the_artery_and_the_device_in_it(study, found, tmp_path):
             assert np.quantile(off_mm, 0.99) < 0.3 * ways_mm.max()
             assert scanned.vessel.lumen.closest(layers["lumen"])[1].max() > 0.8 * off_mm.max()
             assert wall.closed.signed_distance(layers["wires"]).max() < 0.4
+        planned = []
+        monkeypatch.setattr("vstent.reporting.plan_sheet.plan_pdf", lambda one: planned.append(one) or b"%PDF")
+        client.get(f"{case}/plan.pdf").raise_for_status()
+        assert planned[0].anatomy.notes[0].startswith("enterprise: The artery opens by 8")
         view = client.get(case).json()
         choices = view["choices"] | {"straightening": "off"}
         client.put(f"{case}/choices", json={"revision": view["revision"], "choices": choices}).raise_for_status()

@@ -334,7 +334,10 @@ class Preview:
         with LOCK:
             found = {one.name: self.deployed(one) for one in chosen}
             metrics = {one.name: {part.id: self._metrics(one, part) for part in one.implants} for one in chosen}
-            return plan_pdf(Planned(state.name, self.anatomy, found, metrics, state.source, day))
+            yields = {one.name: self._yielded(one.name, self.stents(one), [])[1] for one in chosen}
+            notes = [f"{name}: {told['straightening']}" for name, told in yields.items() if told]
+            anatomy = replace(self.anatomy, notes=(*notes, *self.anatomy.notes))
+            return plan_pdf(Planned(state.name, anatomy, found, metrics, state.source, day))
 
     def _place(self, implant: Implant, stent: Stent, found: Sketch | Deployment | None) -> dict[str, Any]:
         """Return the position of a device on its path; where it has a preview, with bands of uncertainty.
