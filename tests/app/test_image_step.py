@@ -141,7 +141,7 @@ MIDDLE_OF_WHITE = """(canvas) => {
         if (Math.min(...data.slice(4 * i, 4 * i + 3)) <= 200) continue;
         (n++, (x += i % width), (y += Math.floor(i / width)));
     }
-    return [(x / n + 0.5) / width - 0.5, (y / n + 0.5) / height - 0.5];
+    return n ? [(x / n + 0.5) / width - 0.5, (y / n + 0.5) / height - 0.5] : [null, null];
 }"""
 COUNT = """(canvas, [r, g, b]) => {
     const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d", { willReadFrequently: true });
@@ -171,7 +171,7 @@ def test_slices_are_linked_and_measure_in_mm(client, size):
         for title, (*_, letters) in LOOKS.items():
             pane = pane_of(page, title)
             playwright.expect(pane).to_be_visible()
-            assert "".join(pane.locator(".slice-side").all_inner_texts()) == letters
+            assert in_time(page, lambda: "".join(pane.locator(".slice-side").all_inner_texts()) == letters)  # noqa: B023
             assert pixels_per_mm(pane) == pytest.approx(pixels_per_mm(pane_of(page, "Axial")))
         follow_the_cross_hair(page)
         measure(page)
@@ -181,7 +181,9 @@ def test_slices_are_linked_and_measure_in_mm(client, size):
 def follow_the_cross_hair(page):
     """A click in one slice turns the other two to that point; keys move by one voxel."""
     axial = pane_of(page, "Axial")
-    middle = axial.locator("canvas").evaluate(MIDDLE_OF_WHITE)
+    canvas = axial.locator("canvas")
+    assert in_time(page, lambda: canvas.evaluate(MIDDLE_OF_WHITE)[0] is not None)  # the slice is drawn
+    middle = canvas.evaluate(MIDDLE_OF_WHITE)
     page.mouse.click(*on_slice(axial, 6, -4.1))
     assert in_time(
         page, lambda: pane_of(page, "Sagittal").locator(".slice-label").inner_text().startswith("Sagittal 18 ")
@@ -194,18 +196,22 @@ def follow_the_cross_hair(page):
     assert drawn_mm == pytest.approx((6, -4), abs=0.35)
     coronal = pane_of(page, "Coronal")
     page.mouse.click(*on_slice(coronal, 6, -5))
-    value, lps, ras = reading(page)
-    assert value == "200"
+    assert in_time(page, lambda: reading(page)[0] == "200")
+    _, lps, ras = reading(page)
     np.testing.assert_allclose(lps[[0, 2]], (CENTER_MM + OFFSET_MM)[[0, 2]], atol=0.15)
     np.testing.assert_allclose(lps, ras * [-1, -1, 1], atol=0.01)
     page.mouse.move(*on_slice(coronal, -12, 12))
-    assert reading(page)[0] == "0"
+    assert in_time(page, lambda: reading(page)[0] == "0")
     coronal.locator(".slice-area").focus()
     page.mouse.move(5, 5)
+    page.wait_for_selector(".slice-reading[data-at=cross]")
     before = reading(page)[1]
     page.keyboard.press("ArrowRight")
     page.keyboard.press("ArrowRight")
     page.keyboard.press("PageUp")
+    assert in_time(
+        page, lambda: np.all(reading(page)[1][:2] != before[:2]) and abs(reading(page)[1][0] - before[0]) > 1
+    )
     moved = np.abs(reading(page)[1] - before)
     assert moved[0] == pytest.approx(1.6, abs=0.4)  # from between two voxels
     assert moved[1] == pytest.approx(0.5, abs=0.1)
@@ -231,7 +237,7 @@ def measure(page):
     page.mouse.down(button="right")
     page.mouse.move(*on_slice(axial, 8, 3), steps=3)
     page.mouse.up(button="right")
-    assert words.inner_text() != before
+    playwright.expect(words).not_to_have_text(before)
     scale = pixels_per_mm(axial)
     page.keyboard.down("Control")
     page.mouse.wheel(0, -400)
@@ -241,7 +247,7 @@ def measure(page):
     playwright.expect(axial.locator(".slice-label")).to_contain_text("MIP 10 mm")
     page.get_by_role("button", name="Reset").click()
     playwright.expect(words).to_have_text(before)
-    assert pixels_per_mm(axial) == pytest.approx(scale)
+    assert in_time(page, lambda: pixels_per_mm(axial) == pytest.approx(scale))
 
 
 def seed_and_crop(client, page, name):

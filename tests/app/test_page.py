@@ -19,6 +19,7 @@ from forks import PHANTOM
 
 import vstent
 from vstent import phantoms
+from vstent.angiography.angiogram import AngiogramSettings
 from vstent.angiography.history import History
 from vstent.app import cuts, intake, ranking, sheets
 from vstent.app.cases import STEPS, Cases, load
@@ -41,8 +42,9 @@ from vstent.io.images import read_image
 from vstent.io.writers import write_stl
 from vstent.plan.ranges import Ranges
 from vstent.study import store as stored
+from vstent.study.contrast import NUMBERS
 from vstent.study.folder import CACHE
-from vstent.study.keys import hash_of, study_keys
+from vstent.study.keys import angiogram_key, hash_of, study_keys
 from vstent.study.ranking_flows import FlowStore
 from vstent.study.repeat import settings_of
 from vstent.study.settings import InputSettings, Settings
@@ -1032,12 +1034,17 @@ def test_the_first_requests_wait_for_one_thread_that_loads(tmp_path):
 
 def keep_contrast(folder):
     """Keep contrast with every flow of a study, as an angiogram does."""
-    for path in kept_flows(folder).values():
+    told = {}
+    for name, path in kept_flows(folder).items():
+        told[name] = {"flow": path.stem.removeprefix(f"flow {name}-"), "measures": {}}
         carrier = load_data(path, FlowField)
-        stored = np.full((3, len(carrier.centers_mm)), 200, np.uint8)
+        levels = np.full((3, len(carrier.centers_mm)), 200, np.uint8)
         block = np.arange(len(carrier.centers_mm))
-        history = History(carrier.centers_mm, carrier.finest.cell_size_mm, block, np.arange(3) / 15, stored, 300.0)
-        save_data(path.with_name(path.name.replace("flow ", "contrast ", 1)), history)
+        history = History(carrier.centers_mm, carrier.finest.cell_size_mm, block, np.arange(3) / 15, levels, 300.0)
+        key = angiogram_key(stored.Key(*told[name]["flow"].split("-")), AngiogramSettings())
+        save_data(stored.Store(path.parent).path(f"contrast {name}", key), history)
+    (folder / "angiogram").mkdir()
+    (folder / "angiogram" / NUMBERS).write_text(json.dumps({"flows": told}))
 
 
 def test_films_of_stored_contrast_come_along_any_direction(flown, tmp_path):

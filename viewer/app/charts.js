@@ -204,7 +204,7 @@ export function curvesChart(curves, now, [width, height], title, chosen) {
     const style = `line curve flow-${names.indexOf(name)} ${region}`;
     parts.push(svg("path", { d: path(time_s.map((t, i) => [x(t), y(values[i])])), class: style }));
   }
-  lines.forEach((line, k) => line.forEach(({ name, words }, i) => parts.push(text(width - right - long(line.slice(0, i)), 13 + 13 * k, words, { class: `tick end flow-${names.indexOf(name)}` }))));
+  lines.forEach((line, k) => line.forEach(({ name, words }, i) => parts.push(text(width - right - long(line.slice(0, i)) - (k ? 34 : 0), 13 + 13 * k, words, { class: `tick end flow-${names.indexOf(name)}` }))));
   parts.push(svg("line", { x1: x(now), x2: x(now), y1: top, y2: height - bottom, class: "cursor" }));
   const chart = svg("svg", { class: "chart", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": "Contrast over time" }, parts);
   chart.addEventListener("click", (event) => chosen(((event.clientX - chart.getBoundingClientRect().left - left) / (width - left - right)) * last));

@@ -185,7 +185,7 @@ export class Films {
     };
     const wires = make("input", { type: "checkbox", checked: this.hasWires, data: { key: "film-wires" }, onChange });
     return [
-      make("label", { className: "field", htmlFor: "field-carm" }, [make("span", {}, ["C-arm"]), field, make("small", {}, ["°"])]),
+      make("label", { className: "field three", htmlFor: "field-carm" }, [make("span", {}, ["C-arm"]), field, make("small", {}, ["°"])]),
       make("div", { className: "tabs", role: "group", ariaLabel: "Direction" }, named),
       make("label", {}, [wires, " Wires of the device"]),
       make("p", { className: "hint" }, ["Drag a film to turn the C-arm. All films share one grey scale. Computed from the flow: noise and bone are not modeled."]),

@@ -535,7 +535,8 @@ class Page {
     const flow = this.sheets?.flow?.[0];
     if (["flow", "report"].includes(this.step) && flow) {
       const stale = this.view.steps.flow === "stale" ? [make("p", { className: "note stale" }, ["Settings have changed since this flow was computed: run the step Flow again."])] : [];
-      parts.push(head("Before and after"), ...stale, changeSheet(flow, this.isWhole, (name) => this.names.treatment(name)), qualitySheet(flow));
+      const both = [changeSheet(flow, this.isWhole, (name) => this.names.treatment(name)), qualitySheet(flow)];
+      parts.push(head("Before and after"), ...stale, ...(flow.qualities.some(({ grade }) => grade === "not usable") ? both.reverse() : both));
       if (this.sheets.ranking?.length) parts.push(...rankedSheet(this.sheets.ranking, (name) => this.names.treatment(name)));
     }
     if (this.isComparing) parts.push(head("Compared"), plainSheet(this.ranking.comparing.sheets(), this.isWhole));
@@ -613,7 +614,7 @@ class Page {
 
   /** Choose; `changes`, or a promise of them, are made on what is chosen when it is their turn: one after the other. */
   choose(changes) {
-    this.changes = this.changes.then(async () => this.send(await changes));
+    this.changes = this.changes.then(async () => this.send(await changes)).catch(this.complain); // the next ones are made nevertheless
     return this.changes;
   }
 

@@ -393,12 +393,13 @@ function sizeWords(page, { device, diameter_mm, length_mm, density_fraction, coi
   return [coils?.length ? coils.map(coilWords).join(", ") : percent(density_fraction), ...(seed ? [`seed ${seed}`] : [])].join(", ");
 }
 
-/** Put other implants in place of those of a treatment. */
-function rebuild(page, treatment, implants, sign = signOf(treatment)) {
-  const built = joined(implants, sign);
+/** Put other implants in place of those that a treatment has when it is the turn of this choice. */
+function rebuild(page, treatment, change, sign = signOf(treatment)) {
+  const build = ({ implants }) => joined(change(implants), sign);
+  const built = build(treatment);
   const isThere = page.view.choices.treatments.some(({ name }) => name === built.name && name !== treatment.name);
   if (isThere) page.tell(`${page.names.treatment(built.name)} is already in the list.`);
-  else page.choose(({ treatments }) => ({ treatments: treatments.map((one) => (one.name === treatment.name ? built : one)) }));
+  else page.choose(({ treatments }) => ({ treatments: treatments.map((one) => (one.name === treatment.name ? build(one) : one)) }));
   page.render();
 }
 
@@ -415,7 +416,7 @@ function joining(page, treatment) {
   if (!canBuild(page, treatment) || implants.length < 2 || outlets.length < implants.length) return [];
   const change = (sign) => {
     const isApart = sign !== "|" || new Set(implants.map(({ placing }) => placing.path)).size === implants.length;
-    rebuild(page, treatment, isApart ? implants : implants.map((implant, i) => ({ ...implant, placing: { path: outlets[i] } })), sign);
+    rebuild(page, treatment, (now) => (isApart ? now : now.map((implant, i) => ({ ...implant, placing: { path: outlets[i] } }))), sign);
   };
   return [select(`join-${treatment.name}`, "Deployed", signOf(treatment), Object.entries(JOINS).map(([sign, [words]]) => [sign, words]), change)];
 }
@@ -425,7 +426,7 @@ function adding(page, treatment) {
   const { implants } = treatment;
   if (!canBuild(page, treatment) || implants.length >= MOST_IMPLANTS) return [];
   const options = page.catalogue.filter(({ use }) => use !== "basket" && (use !== "coils" || signOf(treatment) === "+")).map(({ key, name }) => make("option", { value: key }, [name]));
-  const add = () => rebuild(page, treatment, [...implants, ...withDevice(box.value).implants.map((implant) => ({ ...implant, placing: {} }))]);
+  const add = () => rebuild(page, treatment, (now) => [...now, ...withDevice(box.value).implants.map((implant) => ({ ...implant, placing: {} }))]);
   let isKeyed = false; // by arrow keys and letters each device on the way is selected: then Enter adds
   const onKeyDown = ({ key }) => {
     isKeyed = true;
@@ -443,13 +444,13 @@ function treatmentRows(page, treatment) {
   const { name, implants } = treatment;
   const isCoils = ({ device }) => page.names.isFor(device, "coils");
   const canChange = signOf(treatment) && implants.length > 1;
-  const swapped = (i, j) => implants.map((implant, k) => implants[k === i ? j : k === j ? i : k]);
+  const swapped = (i, j) => (now) => now.map((_, k) => now[k === i ? j : k === j ? i : k]);
   const act = (sign, words, id, changed) => button(sign, () => rebuild(page, treatment, changed), { className: "icon", title: `${words} ${page.names.implant(name, id)}`, ariaLabel: `${words} ${page.names.implant(name, id)}` });
   const row = ({ id, ...implant }, i) => {
     const acts = [
       ...(i && !isCoils(implant) ? [act("↑", "Deploy earlier:", id, swapped(i - 1, i))] : []),
       ...(i < implants.length - 1 && !isCoils(implants[i + 1]) ? [act("↓", "Deploy later:", id, swapped(i, i + 1))] : []),
-      act("×", "Remove", id, implants.filter((_, k) => k !== i)),
+      act("×", "Remove", id, (now) => now.filter((_, k) => k !== i)),
     ];
     return make("div", { className: "implant" }, [make("span", {}, [page.names.implant(name, id), " ", make("small", {}, [sizeWords(page, implant)])]), ...(canChange ? acts : [])]);
   };
@@ -536,7 +537,7 @@ function paths(page) {
   const { beside } = implant.placing; // the paths of stents side by side with it
   const ways = [["parent", "parent artery"], ...outlets.map((role) => [role, `inlet to ${spoken(role)}`]), ...pairs.map((pair) => [pair.join(">"), pair.map(spoken).join(" to ")])];
   const options = beside.length ? ways.filter(([role]) => outlets.includes(role) && !beside.includes(role)) : ways;
-  const moved = (path) => treatment.implants.map((one) => (one === implant ? { ...one, placing: { path } } : one));
+  const moved = (path) => (now) => now.map((one) => (one.id === implant.id ? { ...one, placing: { path } } : one));
   const change = (path) => (beside.length ? rebuild(page, treatment, moved(path)) : page.changeImplant(treatment.name, implant.id, { placing: { path } }));
   return [select("path", "Path", implant.placing.path, options, change)];
 }

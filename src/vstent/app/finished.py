@@ -1,5 +1,6 @@
 """Results of the last finished study in a case folder, found through its `run.json`; such folders as cases."""
 
+import glob
 import json
 from functools import lru_cache
 from pathlib import Path
@@ -50,8 +51,18 @@ def shown_flows(folder: Path, state: State) -> dict[str, Path]:
 def kept_histories(folder: Path) -> dict[str, Path]:
     """Return the stored contrast of all flows of the last finished study by name; empty where one is missing."""
     flows = kept_flows(folder)
-    paths = {name: path.with_name("contrast" + path.name.removeprefix("flow")) for name, path in flows.items()}
-    return paths if all(path.is_file() for path in paths.values()) else {}
+    if not flows:
+        return {}
+    from vstent.study.contrast import written
+    from vstent.study.store import KEY_DIGITS
+
+    told, found = written(folder), {}
+    for name, path in flows.items():
+        if told.get(name, {}).get("flow") != path.stem.removeprefix(f"flow {name}-"):
+            return {}
+        key = "-".join(2 * ["?" * KEY_DIGITS])  # one file, since the store deletes those of other settings
+        found[name] = next(path.parent.glob(f"contrast {glob.escape(name)}-{key}.npz"), path.with_name("absent"))
+    return found if all(path.is_file() for path in found.values()) else {}
 
 
 def lost_steps(folder: Path, state: State) -> set[str]:

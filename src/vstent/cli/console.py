@@ -125,7 +125,8 @@ def _state(told: Progress) -> str:
     if told.residual is not None:
         parts.append(f"{told.residual:.1%} from convergence")
     if told.seconds_left is not None:
-        parts.append(f"{told.seconds_left:.0f} s left")
+        left_s = told.seconds_left
+        parts.append(f"{left_s:.0f} s left" if left_s < 90 else f"about {left_s / 60:.0f} min left")
     return ", ".join(part for part in parts if part)
 
 

@@ -19,7 +19,7 @@ from vstent.units import PA_PER_MMHG, counted
 
 MEAN_INLET_SPEED_M_S: Final = 0.27
 """Default mean speed in an inlet, m/s, for an internal carotid artery: that of VaMPy. Its companion VaSP has 0.31."""
-ASSUMED: Final = f"assumed: {MEAN_INLET_SPEED_M_S} m/s, the default of VaMPy"
+ASSUMED: Final = f"assumed: mean inlet velocity {MEAN_INLET_SPEED_M_S} m/s"
 """Where an inflow comes from that is not given."""
 
 

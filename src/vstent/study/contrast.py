@@ -99,7 +99,7 @@ def _write(out: Path, found: Mapping[str, Angiogram], settings: AngiogramSetting
     """Write the curves, the numbers, and the metrics with the numbers added."""
     folder = out / FOLDER
     folder.mkdir(exist_ok=True)
-    former = {key for flow in _written(out).values() for key in flow["measures"]}
+    former = {key for flow in written(out).values() for key in flow["measures"]}
     rows = [
         {
             "flow": name,
@@ -124,7 +124,7 @@ def _write(out: Path, found: Mapping[str, Angiogram], settings: AngiogramSetting
     write_json(out / METRICS, metrics)
 
 
-def _written(out: Path) -> dict[str, Any]:
+def written(out: Path) -> dict[str, Any]:
     """Return key and measures of the angiograms that a case folder holds, by name of the flow."""
     with suppress(*UNREADABLE):
         flows = json.loads((out / FOLDER / NUMBERS).read_text(encoding="utf-8"))["flows"]
@@ -145,7 +145,7 @@ def add_measures(metrics: dict[str, Any], measures: Mapping[str, Mapping[str, fl
 def stored_measures(out: Path, keys: Mapping[str, Key]) -> dict[str, dict[str, float]]:
     """Return the measures of the angiograms in a case folder that belong to the flows of a run, by name."""
     own = {name: str(key) for name, key in _flow_keys(keys).items()}
-    return {name: one["measures"] for name, one in _written(out).items() if one["flow"] == own.get(name)}
+    return {name: one["measures"] for name, one in written(out).items() if one["flow"] == own.get(name)}
 
 
 def stents_of(out: Path, names: Iterable[str]) -> tuple[Anatomy, dict[str, list[Stent]]]:
