@@ -4,10 +4,10 @@ Four causes are varied, each uniformly within plus or minus its range and indepe
 the scan (all diameters), the landing position, the manufactured diameter of the device, and the mean inflow. The
 numbers of the device vary with them, each within its range in the catalogue (`vstent.devices.ranges`). Points are those
 of a Sobol sequence, each in the middle of its stratum. Every cause alone is thus sampled evenly, and
-the same study gives the same result. Of coils the seed varies alone.
+the same study gives the same result. Every sample of coils has a seed of its own; of coils alone nothing else varies.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Final
@@ -140,6 +140,7 @@ def vary(
     anatomy: Anatomy,
     deployment: Deployment,
     ranges: Ranges,
+    coils: Sequence[Stent] = (),
     *,
     flow: FlowSettings | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -147,6 +148,7 @@ def vary(
 ) -> Uncertainty:
     """Repeat a deployment with its causes varied: artery, position of the middle row, size and numbers of the device.
 
+    The same `coils` that it keeps in the sac are placed behind every sample, each time with another seed.
     The first ``ranges.flow_samples`` samples are computed with a flow of these settings and stored in `checkpoint`, so
     that an interrupted study resumes after the last of them. `progress` is called with the number of finished samples
     and the number of all. An InputError says that the range of the threshold would close the artery, or that of the
@@ -167,7 +169,9 @@ def vary(
 
     def sample(number: int, wanted: FlowSettings | None) -> dict[str, float]:
         made = values_at(numbers, points[number, len(CAUSES) :])
-        return _sample(anatomy, deployment.stent, points[number, : len(CAUSES)] * spread, made, wanted)
+        offset = points[number, : len(CAUSES)] * spread
+        again = [replace(one, seed=one.seed + number) for one in coils if isinstance(one, Coils)]
+        return _sample(anatomy, deployment.stent, offset, made, again, wanted)
 
     names, values = _results(sample, len(points), ranges, flow, progress, checkpoint)
     half = [0.5 * (one.high - one.low) for one in numbers]
@@ -194,15 +198,8 @@ def vary_seeds(
 
     def sample(number: int, wanted: FlowSettings | None) -> dict[str, float]:
         placed = deploy_coils(coils.design.key, anatomy, coils.coils, seed=coils.seed + number)
-        measures = measure(anatomy, placed)
-        found = {name: float(measures[name]) for name in COIL_RESULTS}
-        if wanted is None:
-            return found
-        shapes, porosity = sac_surfaces(anatomy), 1.0 - found["packing_density_fraction"]
-        after = indices(simulate_case(flow_case(anatomy, (placed.stent,), wanted), start=bare(wanted)), *shapes)
-        after = after if wanted.numerics.resolve_wires else between_coils(after, porosity)
-        changes = ratios(indices(bare(wanted), *shapes), after)
-        return found | {name: changes[name] for name in FLOW_RESULTS if name in changes}
+        found = _found(anatomy, placed)
+        return found if wanted is None else found | _changes(anatomy, bare(wanted), [placed.stent], wanted)
 
     names, values = _results(sample, ranges.samples, ranges, flow, progress, checkpoint)
     return Uncertainty(np.zeros(len(CAUSES)), np.zeros((len(values), len(CAUSES))), names, values)
@@ -247,25 +244,43 @@ def made_wider(design: Design, size: Size, by_mm: float) -> Size:
 
 
 def _sample(
-    anatomy: Anatomy, stent: Stent, offset: Floats, made: Mapping[str, float], flow: FlowSettings | None
+    anatomy: Anatomy,
+    stent: Stent,
+    offset: Floats,
+    made: Mapping[str, float],
+    coils: Sequence[Coils],
+    flow: FlowSettings | None,
 ) -> dict[str, float]:
-    """Return the results with causes changed by `offset` (4,) and numbers `made`; empty if the device does not fit."""
+    """Return the results with causes changed by `offset` (4,) and numbers `made`; empty if a device does not fit."""
     diameter_mm, along_mm, wider_mm, inflow_fraction = (float(value) for value in offset)
     other = widened(anatomy, diameter_mm) if diameter_mm else anatomy
     try:
         design, size = altered(stent.design, stent.size, made)
         size = made_wider(design, size, wider_mm)
-        deployed = deploy(design, other, size=size, landing=Landing(stent.middle_abscissa_mm + along_mm))
+        placed = [deploy(design, other, size=size, landing=Landing(stent.middle_abscissa_mm + along_mm))]
+        inside = [placed[0].stent]
+        placed += [deploy_coils(one.design.key, other, one.coils, inside=inside, seed=one.seed) for one in coils]
     except (DeviceError, LandingError):
         return {}
-    measures = measure(other, deployed)
-    found: dict[str, float] = {name: float(measures[name]) for name in RESULTS if name in measures}
+    found = {name: value for one in placed for name, value in _found(other, one).items()}
     if flow is None or not other.aneurysms:
         return found
     inflow_mL_s = flow_case(anatomy, (), flow).inflow_mL_s * (1 + inflow_fraction)
     flow = replace(flow, inflow_mL_s=inflow_mL_s, inlet_speed_m_s=None)
-    shapes = sac_surfaces(other)
     bare = simulate_case(flow_case(other, (), flow))
-    after = simulate_case(flow_case(other, (deployed.stent,), flow), start=bare)
-    changes = ratios(indices(bare, *shapes), indices(after, *shapes))
-    return found | {name: changes[name] for name in FLOW_RESULTS if name in changes}
+    return found | _changes(other, bare, [one.stent for one in placed], flow)
+
+
+def _found(anatomy: Anatomy, placed: Deployment) -> dict[str, float]:
+    """Return the measures of a deployment for which intervals are computed."""
+    measures, names = measure(anatomy, placed), COIL_RESULTS if isinstance(placed.stent, Coils) else RESULTS
+    return {name: float(measures[name]) for name in names if name in measures}
+
+
+def _changes(anatomy: Anatomy, bare: FlowField, stents: Sequence[Stent], flow: FlowSettings) -> dict[str, float]:
+    """Return the ratios of the flow with devices to that without for which intervals are computed."""
+    shapes, density = sac_surfaces(anatomy), sum(one.density_fraction for one in stents if isinstance(one, Coils))
+    after = indices(simulate_case(flow_case(anatomy, stents, flow), start=bare), *shapes)
+    after = after if flow.numerics.resolve_wires else between_coils(after, 1.0 - density)
+    changes = ratios(indices(bare, *shapes), after)
+    return {name: changes[name] for name in FLOW_RESULTS if name in changes}
