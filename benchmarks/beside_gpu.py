@@ -44,7 +44,7 @@ def timed(name: str, work: Callable[[], Result]) -> Result:
 
 def evaluate(engine: LatticeBoltzmann, state: State) -> None:
     """Do what a check takes after it has been read."""
-    state.history.append(stepping.monitored(state, state.snapshots[-1]))
+    state.history.append(stepping.monitored(state, [state.snapshots[-1]]))
     state.blocks = settling.with_check(state.blocks, state.snapshots[-1])
     engine.terminate(state)
 

@@ -118,7 +118,7 @@ def test_streamlines_that_the_page_has_are_not_sent_again(preview: LiveFlowProce
 
 
 def test_killed_it_begins_again_with_the_same_device(preview: LiveFlowProcess) -> None:
-    before = manifest(preview)["reductions"]["neck_inflow_mL_s"]
+    before = until(preview, lambda told: told["is_settled"])["reductions"]["neck_inflow_mL_s"]
     os.kill(preview._process.pid, signal.SIGKILL)
     preview._process.join(10)
     told = until(preview, lambda told: not told["is_stale"] and told["is_settled"])

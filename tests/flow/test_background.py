@@ -2,7 +2,6 @@
 
 from functools import partial
 from threading import Event, get_ident
-from types import SimpleNamespace
 
 import numba
 import numpy as np
@@ -133,9 +132,3 @@ def test_a_prepared_flow_is_the_same() -> None:
         first, second = engine.step(first), engine.step(second)
     np.testing.assert_array_equal(first.populations, second.populations)
     np.testing.assert_array_equal(first.domain.depth_mm, second.domain.depth_mm)
-
-
-def test_the_grid_of_a_refined_sac_waits_for_the_flow_around_it() -> None:
-    engine, flow = LatticeBoltzmann(0.3, outer=SimpleNamespace()), case(HERE)
-    engine.prepare(flow)
-    assert "depth_mm" not in vars(LatticeBoltzmann(0.3).init(flow, None).domain)

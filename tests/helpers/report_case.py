@@ -200,7 +200,8 @@ def case(name="Bent tube with a sac"):
         notes=("Units were guessed as mm from the size of the artery.",),
         keys={},
         whole=None,
-        straightened={},
+        yielded={},
+        shown=fields,
     )
 
 

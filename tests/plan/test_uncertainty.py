@@ -6,13 +6,14 @@ from functools import cache
 
 import numpy as np
 import pytest
-from tubes import line, tube, with_neck
+from tubes import arc, line, tube, with_neck
 
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.cli import main
 from vstent.cli.finished import RECORD
 from vstent.deployment.deploy import deploy
+from vstent.deployment.straightening import straighten
 from vstent.devices import catalogue, formulas
 from vstent.devices.ranges import altered, uncertain, values_at
 from vstent.devices.stent import Landing
@@ -24,7 +25,7 @@ from vstent.phantoms import demo_phantom, phantom_surface
 from vstent.plan import uncertainty
 from vstent.plan.ranges import Ranges
 from vstent.plan.shares import first_order_shares
-from vstent.plan.uncertainty import CAUSES, Uncertainty, vary
+from vstent.plan.uncertainty import CAUSES, STIFFNESS, Uncertainty, vary
 from vstent.plan.widening import widened
 from vstent.study.folder import CACHE
 from vstent.study.store import Unfinished
@@ -323,3 +324,69 @@ def test_the_band_of_the_neck_is_among_the_intervals():
     row = intervals({"uncertainty": found})[-1]
     assert (row.mean, row.low, row.high) == ("10.0\u202fmm²", "9.00\u202fmm²", "12.0\u202fmm²")
     assert row.shares == [("choice of the neck plane", 1.0)]
+
+
+@pytest.fixture(scope="module")
+def bent():
+    """An artery with a bend of 90 degrees and 7 mm and a neck, and an Enterprise in it whose numbers have no ranges."""
+    anatomy = with_neck(tube(arc(7.0, np.pi / 2, straight_mm=16.0), 1.6, around=32), 19.0, 23.0)
+    design = replace(catalogue.find_design("enterprise"), ranges=())
+    return anatomy, deploy(design, anatomy, size=design.sizes[0])
+
+
+STILL = {"threshold_mm": 0.0, "landing_mm": 0.0, "device_mm": 0.0, "inflow_fraction": 0.0}
+
+
+def test_the_stiffness_varies_in_an_artery_that_yields(bent):
+    """Its samples are those of `straighten` between the ends of the range, and it is the only cause."""
+    anatomy, lies = bent
+    found = vary(anatomy, lies, Ranges(8, **STILL), straightening="immediate")
+    assert found.causes == (*CAUSES, STIFFNESS)
+    opened, radius = (found.values[:, found.names.index(one)] for one in ("straightened_rad", "bend_radius_after_mm"))
+    order = np.argsort(found.points[:, -1])
+    assert (np.diff(opened[order]) > 0).all()
+    assert (np.diff(radius[order]) > 0).all()
+    whole = straighten(anatomy, [lies]).metrics()
+    assert whole["straightened_low_rad"] < opened.min() < whole["straightened_rad"] < opened.max()
+    assert opened.max() < whole["straightened_high_rad"]
+    ends = [straighten(anatomy, [lies], place=place).metrics()["straightened_rad"] for place in (-1.0, 1.0)]
+    assert ends == pytest.approx([whole["straightened_low_rad"], whole["straightened_high_rad"]], rel=0.1)
+    assert found.shares("straightened_rad")[STIFFNESS] > 0.95
+    assert np.ptp(found.values[:, 0]) == 0.0  # the device of the plan lies in the rigid artery
+
+
+def test_a_measured_angle_has_no_range(bent):
+    anatomy, lies = bent
+    found = vary(anatomy, lies, Ranges(2, **STILL), straightening="4deg")
+    assert found.causes == CAUSES
+    assert np.degrees(found.interval("straightened_rad")) == pytest.approx(3 * (4.0,), abs=0.6)
+    failed = vary(anatomy, lies, Ranges(2, **STILL), straightening="170deg")  # no stiffness gives it
+    assert failed.n_failed == 0
+    assert "straightened_rad" not in failed.names
+
+
+def test_flows_in_the_artery_that_yields_are_relative_to_the_rigid_one(bent, monkeypatch):
+    """A flow whose neck inflow is the length of the axis, and 100 less for every device."""
+    monkeypatch.setattr(uncertainty, "simulate_case", lambda case, start=None: case)
+    monkeypatch.setattr(uncertainty, "flow_case", lambda artery, stents, flow: Known(artery, len(stents)))
+    monkeypatch.setattr(uncertainty, "indices", lambda case, *_: {"neck_inflow_mL_s": case.speed})
+    monkeypatch.setattr(uncertainty, "sac_surfaces", lambda *_: ())
+    anatomy, lies = bent
+    ranges = Ranges(2, flow_samples=2, **STILL)
+    found = vary(anatomy, lies, ranges, flow=FlowSettings(inflow_mL_s=4.0), straightening="immediate")
+    length_mm = anatomy.parent.axis.length_mm
+    for row in found.values:
+        value = dict(zip(found.names, row, strict=True))
+        assert value["neck_inflow_mL_s_ratio"] == pytest.approx(1 - 100 / length_mm)
+        alone, both = (value[f"straightened{what}_neck_inflow_mL_s_ratio"] for what in ("_bare", ""))
+        assert 0.9 < alone < 1
+        assert alone - both == pytest.approx(100 / length_mm)
+
+
+class Known:
+    """A flow by the length of the axis and the number of devices."""
+
+    inflow_mL_s = 4.0
+
+    def __init__(self, artery, devices):
+        self.speed = artery.parent.axis.length_mm - 100 * devices

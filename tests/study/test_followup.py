@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tubes import line, tube, with_neck
 
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
@@ -67,7 +68,11 @@ def test_the_map_of_a_moved_and_bent_vessel_is_found(degrees, plan, tmp_path):
     assert np.degrees(true_rad - found.planned["arms_angle_rad"]) == pytest.approx(degrees, abs=2.0)
     draw_followup(tmp_path / "followup.png", anatomy, found)
     assert (tmp_path / "followup.png").read_bytes()[1:4] == b"PNG"
-    assert followup_table(found).columns[0]._cells == ["Angle of the arms", "Radius of the sharpest bend"]
+    assert followup_table(found).columns[0]._cells == [
+        "Angle of the arms",
+        "Radius of the sharpest bend",
+        "Straightening",
+    ]
     assert found.metrics()["registration"]["residual_mm"] < 0.1
 
 
@@ -96,3 +101,18 @@ def test_wires_in_a_scan_show_where_the_device_lies(plan, tmp_path):
     for end, true_mm in zip(("proximal", "distal"), ends_mm, strict=True):
         assert found.real[f"{end}_end_to_neck_middle_mm"] == pytest.approx(true_mm, abs=1.2)
     assert found.real["mean_diameter_mm"] == pytest.approx(found.planned["mean_diameter_mm"], abs=0.3)
+
+
+def test_straight_arms_and_a_sac_that_is_gone(tmp_path):
+    """A straight artery whose sac is occluded: its arms stay straight, wherever along it the device lies."""
+    artery = tube(line(36.0), 1.9)
+    anatomy = with_neck(artery, 16.0, 20.0)
+    stent = deploy("enterprise", anatomy, landing=Landing(18.0)).stent
+    write_stl(tmp_path / "after.stl", after(artery.vessel, np.random.default_rng(3)))
+    found = compare_followup(anatomy, stent, tmp_path / "after.stl")
+    assert not found.anatomy.aneurysms
+    assert np.degrees(found.real["arms_angle_rad"]) == pytest.approx(180.0, abs=2.0)
+    assert np.degrees(found.real["straightened_rad"]) == pytest.approx(0.0, abs=2.0)
+    assert found.real["bend_radius_mm"] > 50
+    way = found.pose.turn @ np.array([0.0, 0.0, 1.0])
+    assert abs(way @ TURN @ np.array([0.0, 0.0, 1.0])) > np.cos(np.radians(2.0))

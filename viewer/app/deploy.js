@@ -19,7 +19,7 @@ export class Deploying {
     this.bands = new Newest((sheet) => !this.isDragging && page.toldBands(sheet), page.complain);
     this.gaps = new Newest((sheet) => sheet && !this.isDragging && page.toldBands(sheet), page.complain); // the bands with those of gaps
     this.sections = new Newest((answer) => page.section.show(answer), () => {});
-    this.cursorMark = { element: make("i", { className: "cursor-mark" }), point: () => this.cursor !== undefined && this.axis.at(this.cursor) };
+    this.cursorMark = { element: make("i", { className: "cursor-mark" }), point: () => this.cursor !== undefined && this.line.at(this.cursor) };
     this.handles = ["proximal", "distal"].map((end, i) => this.handle(end, i));
   }
 
@@ -27,6 +27,11 @@ export class Deploying {
   setAxis(axis) {
     this.axis = axis;
     this.cursor = undefined;
+  }
+
+  /** The parent axis as it is drawn: moved where the artery yields to the device in view. */
+  get line() {
+    return (this.isHere && !this.place.axis && this.moved) || this.axis;
   }
 
   handle(end, i) {
@@ -101,10 +106,14 @@ export class Deploying {
 
   take(answer) {
     this.place = answer.manifest;
+    const { axis: other = this.axis, moved_axis, treatment } = this.place;
+    if (!moved_axis) this.page.picture.dropMoved(treatment);
+    this.moved = moved_axis ? new Axis({ points: moved_axis, abscissa: other.abscissa }, this.page.picture) : null;
     this.page.picture.put(answer);
     if (this.place.is_coils) return this.page.along.set({ device: null });
     const { axis, is_basket, profile, ends_mm, ends_band_mm = [], neck = this.page.anatomy.neck } = this.place;
     this.way = axis ? new Axis(axis, this.page.picture) : this.axis;
+    if (this.moved && !is_basket) this.way = this.moved;
     this.handles.forEach(({ element }, i) => {
       label(element, is_basket ? heightWords(ends_mm[0]) : reachWords(i, ends_mm[i], neck));
       element.classList.toggle("bad", !is_basket && reachOf(i, ends_mm[i], neck) < 0);

@@ -296,6 +296,7 @@ class Page {
       this.sheets = sheets;
       this.flowPanes = answer.manifest.panes;
       this.times = answer.manifest.times_s;
+      for (const pane of this.flowPanes) if (this.picture.isMoved(pane)) this.picture.dropMoved(pane, ["wires", "contour"]);
       this.picture.put(answer);
       this.render();
     } catch (problem) {
@@ -436,7 +437,8 @@ class Page {
     return names.map((name) => {
       const i = sheet?.names.indexOf(name) ?? -1;
       const said = i < 0 ? row?.cells[0] : `${row?.cells[1 + 2 * i]} (${row?.cells[2 + 2 * i]})`;
-      const note = row && (i >= 0 || name === "bare") ? `${row.name} ${said}` : "";
+      const isYielded = this.picture.isMoved(name); // the numbers of the table are those in the artery as scanned
+      const note = isYielded ? "Artery straightened" : row && (i >= 0 || name === "bare") ? `${row.name} ${said}` : "";
       return { id: name, title: name === "bare" ? "Before (no device)" : this.names.treatment(name), note };
     });
   }
@@ -465,8 +467,8 @@ class Page {
   renderDeploy() {
     const { treatment, implant } = this;
     if (!treatment || this.asksForAneurysm) return;
-    this.picture.moved = (event) => this.deploying.look(this.axis.under(event, null));
-    const key = JSON.stringify([treatment, implant.id, this.colour, this.view.anatomy, this.view.job?.kind === "place"]);
+    this.picture.moved = (event) => this.deploying.look(this.deploying.line.under(event, null));
+    const key = JSON.stringify([treatment, implant.id, this.colour, this.view.anatomy, this.view.choices.straightening, this.view.job?.kind === "place"]);
     if (this.shownTreatment !== key || !this.measures[treatment.name]) {
       this.shownTreatment = key;
       this.deploying.show(treatment.name, implant.id);
@@ -561,6 +563,7 @@ class Page {
       else this.deploying.look(this.deploying.cursor);
     }
     this.panel.querySelector(".place")?.replaceChildren(...placeWords(manifest, this.bands, this.anatomy.neck));
+    this.panel.querySelector(".yielding")?.replaceChildren(manifest.straightening ?? "");
   }
 
   /** The bands of the device that lies still; null while it is dragged. */
@@ -756,7 +759,7 @@ const LAYERS = {
   flow: (page) => {
     const mode = page.memory.mode || "streamlines";
     const modes = ["streamlines", "slice", "shear", "sac_shear"].map((id) => ({ id, on: mode === id }));
-    return [{ ...LUMEN, on: mode !== "shear" }, ...modes, { id: "wires", title: "Wires", on: false }, { id: "straightened", title: "Straightened", on: true }, NECK];
+    return [{ ...LUMEN, on: mode !== "shear" }, ...modes, { id: "wires", title: "Wires", on: false }, NECK];
   },
   report: (page) => LAYERS.flow(page),
 };

@@ -188,6 +188,8 @@ export const panels = {
     const colour = "Colour of the wires";
     parts.push(
       make("div", { className: "place" }, isHere(page.place) ? placeWords(page.place, isHere(page.bands) ? page.bands : null, page.anatomy.neck) : []),
+      select("straightening", "Artery", page.view.choices.straightening, STRAIGHTENINGS, (value) => page.choose({ straightening: value })),
+      make("p", { className: "hint yielding" }, [isHere(page.place) ? (page.place.straightening ?? "") : ""]),
       make("div", { className: "bands" }, isHere(page.bands) ? bandWords(page.bands) : []),
       make("div", { className: "label" }, [colour]),
       tabs(colour, page.colour, [["wall_gap", "Wall gap"], ["coverage", "Coverage"], ["diameter", "Diameter"]], (id) => page.show({ colour: id })),

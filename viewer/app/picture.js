@@ -81,6 +81,16 @@ export class Picture {
     this.apply();
   }
 
+  /** Whether a pane has the wall of an artery that has yielded to its devices. */
+  isMoved(pane) {
+    return this.stage?.layers.some((layer) => layer.id === "lumen" && layer.pane === pane);
+  }
+
+  /** Take away what has moved in a pane with its devices, so that it shows the artery as scanned. */
+  dropMoved(pane, more = []) {
+    this.stage?.drop((layer) => layer.pane === pane && ["lumen", "neck", "axis", ...more].includes(layer.id));
+  }
+
   /** Offer the views of what is shown, a scan or a vessel; the other one than before is looked at anew. */
   setViews(what, views, id) {
     this.views = views || [];

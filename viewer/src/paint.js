@@ -1,6 +1,8 @@
 // Materials: shaded surfaces (plain, coloured by a scale, or glass) and round lines that never get thinner than a hair.
 import * as THREE from "three";
 
+const FAINT = 0.35;
+
 /** Colour behind everything. */
 export const PAPER = 0xf6f8f9;
 
@@ -34,6 +36,7 @@ const SURFACE_FRAGMENT = `
   ${LIGHT}
   ${MAPPED}
   uniform float opacity;
+  uniform float strength;
   varying vec3 vNormal;
   varying vec3 vEye;
   void main() {
@@ -46,7 +49,7 @@ const SURFACE_FRAGMENT = `
     float gloss = 0.10 * pow(max(dot(reflect(-LIGHT, normal), eye), 0.0), 32.0);
     float grazing = pow(1.0 - min(abs(facing), 1.0), 3.0);
     float alpha = opacity < 1.0 ? opacity + (1.0 - opacity) * 0.75 * grazing : 1.0;
-    gl_FragColor = vec4(baseColour() * light + gloss, alpha);
+    gl_FragColor = vec4(baseColour() * light + gloss, alpha * strength);
   }`;
 
 // A line is a ribbon that faces the eye, as wide as its diameter and at least `hair` pixels, shaded like a cylinder.
@@ -106,6 +109,11 @@ function uniforms(layer, scale) {
   };
 }
 
+/** Draw a surface that others have replaced faintly, or as it is. */
+export function weaken(object, isFaint) {
+  object.traverse(({ material }) => material?.uniforms.strength && (material.uniforms.strength.value = isFaint ? FAINT : 1));
+}
+
 /** A surface; a translucent one is drawn far side first, then near side. */
 export function surface(layer, geometry, scale) {
   const glass = layer.opacity < 1;
@@ -113,7 +121,7 @@ export function surface(layer, geometry, scale) {
     new THREE.ShaderMaterial({
       vertexShader: SURFACE_VERTEX,
       fragmentShader: SURFACE_FRAGMENT,
-      uniforms: { ...uniforms(layer, scale), opacity: { value: layer.opacity } },
+      uniforms: { ...uniforms(layer, scale), opacity: { value: layer.opacity }, strength: { value: 1 } },
       transparent: glass,
       depthWrite: !glass,
       // Glass that lies on an opaque wall must not flicker with it: it is drawn a little behind.

@@ -168,8 +168,12 @@ export class Stage {
       this.camera.updateProjectionMatrix();
       const ratio = this.renderer.getPixelRatio();
       this.shared.pixel.value = (2 * Math.tan((this.camera.fov * Math.PI) / 360)) / (pane.height * ratio);
-      for (const layer of this.layers)
-        layer.object.visible = this.shown.has(layer.id) && (layer.pane === "" || layer.pane === pane.id);
+      const own = new Set(this.layers.filter((layer) => layer.pane === pane.id).map(({ id }) => id));
+      for (const layer of this.layers) {
+        const isReplaced = layer.pane === "" && own.has(layer.id); // by one of the pane's own: of the wall an outline is left
+        layer.object.visible = this.shown.has(layer.id) && (layer.pane === pane.id || (layer.pane === "" && (!isReplaced || layer.id === "lumen")));
+        if (layer.id === "lumen") paint.weaken(layer.object, isReplaced);
+      }
       this.renderer.setViewport(pane.left, pane.bottom, pane.width, pane.height);
       this.renderer.setScissor(pane.left, pane.bottom, pane.width, pane.height);
       this.renderer.render(this.scene, this.camera);

@@ -13,9 +13,9 @@ export { Raycaster, Vector2, Vector3 } from "three";
 
 const MODES = [
   { id: "anatomy", title: "Anatomy", layers: ["lumen", "continued", "landing", "sac", "neck"] },
-  { id: "device", title: "Device", layers: ["lumen", "straightened", "continued", "wires", "contour", "neck"] },
+  { id: "device", title: "Device", layers: ["lumen", "continued", "wires", "contour", "neck"] },
   { id: "wires", title: "Wires", layers: ["lumen", "continued", "wires", "neck"] },
-  { id: "flow", title: "Blood flow", layers: ["lumen", "straightened", "streamlines", "neck"] },
+  { id: "flow", title: "Blood flow", layers: ["lumen", "streamlines", "neck"] },
   { id: "shear", title: "Wall shear stress", layers: ["shear", "neck"] },
   { id: "sac_shear", title: "Sac shear stress", layers: ["lumen", "sac_shear", "neck"] },
 ];
@@ -23,7 +23,6 @@ const MODES = [
 const LAYERS = [
   ["lumen", "Lumen (patient)"],
   ["landing", "Restored parent artery"],
-  ["straightened", "Straightened artery"],
   ["continued", "Continued artery (assumed)"],
   ["sac", "Sac"],
   ["neck", "Neck"],

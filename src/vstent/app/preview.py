@@ -5,6 +5,7 @@ from contextlib import suppress
 from dataclasses import replace
 from datetime import date
 from functools import partial
+from glob import escape
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar, cast
 
@@ -23,12 +24,14 @@ from vstent.app.cuts import cut
 from vstent.app.films import films_message, kept_curves
 from vstent.app.finished import kept_histories, shown_flows
 from vstent.app.scans import LOCK
+from vstent.app.yielding import Yielding
 from vstent.deployment.basket import room_of
 from vstent.deployment.contour import planes
 from vstent.deployment.deploy import propose_landing
 from vstent.deployment.measure import measure, measure_together
 from vstent.deployment.method import laid_inside
 from vstent.deployment.sketch import MeasuredWall, Sketch, measured_wall, sketch
+from vstent.deployment.straightening import Straightening
 from vstent.devices.catalogue import find_design
 from vstent.devices.design import Basket, Coil
 from vstent.devices.formulas import coverage_fraction, free_diameters_mm
@@ -44,7 +47,6 @@ from vstent.flow.simulation import foretell_cost
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import PARENT, Anatomy, Opening
 from vstent.io.archive import load_data
-from vstent.io.surfaces import read_surface
 from vstent.kernels import triangles
 from vstent.kernels.arrays import Floats
 from vstent.plan.bands import gap_bands
@@ -58,15 +60,16 @@ from vstent.reporting.scene import (
     flow_layers,
     implant_titles,
     node_coverage,
+    own_layers,
     scales_of,
-    straightened_layer,
     treatment_title,
     view_of,
     views_of,
+    wire_layer,
 )
 from vstent.reporting.uncertainty import band_rows, how_sure
-from vstent.study.folder import CACHE, straightened_folder
-from vstent.study.keys import stage_name, study_keys
+from vstent.study.folder import CACHE
+from vstent.study.keys import ALONE, STRAIGHTENED, flow_stage, stage_name, study_keys
 from vstent.study.stages import ask_for_aneurysm, bands_of, deploy_implant, landing_of, size_of
 from vstent.study.store import Store
 
@@ -280,19 +283,42 @@ class Preview:
         if self._follow is not None:
             self._follow(stents)
 
-    def _flow_layers(self, name: str, path: Path, moment: int | None) -> list[MeshLayer | LineLayer]:
-        """Return the layers of a flow, with its cut: of its mean, or of one moment of its last cycle."""
+    def _flow_layers(
+        self, name: str, path: Path, moment: int | None, yielded: Straightening | None = None
+    ) -> list[MeshLayer | LineLayer]:
+        """Return the layers of a flow, with its cut: of its mean, or of one moment of its last cycle.
+
+        With an artery that has yielded come its wall and the devices in it.
+        """
 
         def draw() -> list[MeshLayer | LineLayer]:
-            shown = self._flow(path, moment)
-            return [*flow_layers(name, shown, self.anatomy), cut(name, shown, self.anatomy)]
+            shown, anatomy = self._flow(path, moment), self.anatomy if yielded is None else yielded.anatomy
+            own = [] if yielded is None else own_layers(name, anatomy)
+            wires = [] if yielded is None else [wire_layer(name, one.stent) for one in yielded.deployed]
+            return [*flow_layers(name, shown, anatomy), cut(name, shown, self.anatomy), *own, *wires]
 
         return self._cached(("layers", path, path.stat().st_mtime_ns, self.case.state.anatomy, moment), draw)
+
+    def _artery(self, name: str) -> Straightening:
+        """Return the artery that has yielded to a treatment, as the last study has stored it."""
+        (path,) = (self.case.folder / CACHE).glob(f"{escape(f'straighten {name}')}-*.npz")
+        return self._loaded(path, Straightening)
 
     def _flow(self, path: Path, moment: int | None) -> FlowField:
         """Return the mean of a flow, or one moment of its last cycle."""
         flow = self._loaded(path, FlowField)
         return flow if moment is None or not flow.phases else flow.at_phase(flow.phases[moment % len(flow.phases)])
+
+    def _yielded(
+        self, pane: str, stents: Sequence[Stent], layers: list[MeshLayer | LineLayer]
+    ) -> tuple[list[MeshLayer | LineLayer], dict[str, Any]]:
+        """Return the layers of devices, in the artery that yields to them where it does, and what a message states."""
+        setting, anatomy = self.case.state.choices.straightening, self.anatomy
+        if setting == "off" or not stents:
+            return layers, {}
+        path = next((one.path for one in stents if one.path != PARENT), PARENT)
+        key = ("yielding", self.case.state.anatomy, path)
+        return self._cached(key, lambda: Yielding(on_path(anatomy, path))).drawn(pane, stents, layers, setting)
 
     def plan(self) -> bytes:
         """Return the plan of the chosen treatments as PDF, one page per implant.
@@ -461,9 +487,10 @@ class Preview:
                 else:
                     drawn[one.id] = self.deployment(treatment, one)
             self._show(tuple(one.stent for one in drawn.values()))
-            layers = [_wires(pane, *_seen(one), colour, partial(_covered, one.stent)) for one in drawn.values()]
+            wires = [_wires(pane, *_seen(one), colour, partial(_covered, one.stent)) for one in drawn.values()]
+            layers, yields = self._yielded(pane, self.shown, [*wires])
             place = self._place(_implant(treatment, implant), drawn[implant].stent, drawn[implant])
-            return message(layers, scales_of(layers, self.anatomy), treatment=pane, implant=implant, **place)
+            return message(layers, scales_of(layers, self.anatomy), treatment=pane, implant=implant, **place, **yields)
 
     def deployment_message(self, treatment: Treatment, implant: str, colour: Colour) -> bytes:
         """Return a deployed treatment with its expansion and its metrics, and the place of one of its implants."""
@@ -471,8 +498,8 @@ class Preview:
             chosen, there = _implant(treatment, implant), self.placed(treatment)
             deployed = self.deployed(there)
             self._show(self.stents(there))
-            layers = self._drawn(treatment.name, there, colour)
-            told: dict[str, Any] = {"treatment": treatment.name, "implant": implant}
+            layers, yields = self._yielded(treatment.name, self.shown, self._drawn(treatment.name, there, colour))
+            told: dict[str, Any] = {"treatment": treatment.name, "implant": implant, **yields}
             told |= {
                 "title": treatment_title(deployed),
                 "measures": self._sheets(there),
@@ -515,10 +542,15 @@ class Preview:
             paths = shown_flows(self.case.folder, self.case.state)
             if not paths:
                 raise ReadError("Some flows of these results are missing. Run the step Flow.")
-            layers = [layer for name, path in paths.items() for layer in self._flow_layers(name, path, moment)]
-            for name in paths:
-                wall = straightened_folder(self.case.folder, name) / "vessel.vtp"
-                layers += [straightened_layer(name, read_surface(wall, units="mm")[0])] if wall.exists() else []
+            arteries = {name: self._artery(name) for name in paths if _flow_name(name, STRAIGHTENED) in paths}
+            aside = [_flow_name(name, end) for name in arteries for end in (ALONE, STRAIGHTENED)]
+            both = {name: paths[_flow_name(name, STRAIGHTENED)] for name in arteries}
+            paths = {name: both.get(name, path) for name, path in paths.items() if name not in aside}
+            layers = [
+                layer
+                for name, path in paths.items()
+                for layer in self._flow_layers(name, path, moment, arteries.get(name))
+            ]
             of_scales, phases = layers, self._loaded(next(iter(paths.values())), FlowField).phases
             if cut_mm is not None:
                 layers = [cut(name, self._flow(path, moment), self.anatomy, cut_mm) for name, path in paths.items()]
@@ -587,6 +619,11 @@ class Preview:
                 "free_diameter_mm": float(free_diameters_mm(stent.design, stent.size)[at_row]),
                 "max_gap_mm": float(deployed[shown_id].wall_gap_mm[at_row].max()),
             }
+
+
+def _flow_name(name: str, end: str) -> str:
+    """Return the name of a flow in an artery that has yielded to a treatment, among stored ones."""
+    return flow_stage(f"{name}{end}").removeprefix("flow ")
 
 
 def _implant(treatment: Treatment, name: str) -> Implant:

@@ -1,6 +1,7 @@
 """`vstent compare-followup`: the artery after a treatment beside what was planned."""
 
 import argparse
+import json
 from pathlib import Path
 
 from vstent.cli import options
@@ -27,6 +28,7 @@ def _compare(arguments: argparse.Namespace) -> int:
     from vstent.io import writers
     from vstent.reporting.followup import draw_followup
     from vstent.study.contrast import stents_of
+    from vstent.study.folder import METRICS
     from vstent.study.followup import compare_followup
     from vstent.study.repeat import finished_run
 
@@ -39,7 +41,8 @@ def _compare(arguments: argparse.Namespace) -> int:
     devices = [one for one in stents[name] if one.design.kind in ("braid", "laser_cut")]
     if not devices:
         raise InputError(f"{name} has no device in the artery: only these are compared.")
-    found = compare_followup(anatomy, devices[0], arguments.followup, arguments.metal)
+    predicted = json.loads((out / METRICS).read_text(encoding="utf-8"))["treatments"][name].get("straightening", {})
+    found = compare_followup(anatomy, devices[0], arguments.followup, arguments.metal, predicted)
     writers.write_json(out / "followup.json", found.metrics())
     draw_followup(out / "followup.png", anatomy, found)
     console.print(followup_table(found))

@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from types import MappingProxyType
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
@@ -11,7 +12,7 @@ from vstent.anatomy.restore.paths import on_path
 from vstent.deployment.beam import Beam
 from vstent.deployment.deploy import deploy
 from vstent.deployment.measure import branches
-from vstent.deployment.motion import Motion, moved
+from vstent.deployment.motion import Motion, Skin, moved
 from vstent.devices.stent import Coils, Deployment, Landing, Stent
 from vstent.devices.stiffness import bending_stiffness_N_mm2
 from vstent.devices.treatment import read_straightening
@@ -28,17 +29,20 @@ BED_N_MM2: Final = 0.004
 """Force per length and displacement of the bed, in N/mm2: 0.001 to 0.006, for a beam embedded in tissue 1.4 times the
 modulus of brain, 3 kPa (1 to 4; Budday et al. 2017, Acta Biomater. 48:319)."""
 SETTINGS: Final[dict[str, tuple[float, float, float]]] = {
-    "immediate": (0.278, 0.0574, 0.543),
-    "six_months": (0.586, 0.0, 1.72),
+    "immediate": (0.180, 0.031, 0.383),
+    "six_months": (0.218, 0.0, 0.570),
 }
 """Factor on the stiffness of the device over that of wall and bed, of every named setting: as likely, lowest, highest.
 
-It is fitted to what laser-cut stents straightened, with an Enterprise in the middle of a bend of 90 degrees and 7.1 mm,
-in an artery 3.25 mm wide, the middle of the range for which it is sold. At implantation the radius increased by 3.6 +-
-2.7 mm (24 patients, stents 25.4 mm long; King et al. 2012, AJNR 33:1657). After six months the angle had increased by
-12.9 +- 13.1 degrees (16 patients; Kono et al. 2014, PLoS ONE 9:e108033; an Enterprise of 22 mm is assumed)."""
+It is fitted to what laser-cut stents straightened, with an Enterprise over the neck in seven carotid siphons
+(``benchmarks/straightening.py fit``). At implantation the mean radius of the bend along the stent increased from
+7.1 by 3.6 +- 2.7 mm, by half (24 patients, stents 25.4 mm long; King et al. 2012, AJNR 33:1657). After six months
+the angle had increased by 12.9 +- 13.1 degrees (16 patients; Kono et al. 2014, PLoS ONE 9:e108033; 14 mm long is
+assumed)."""
 OVER_MM: Final = 4.0
 """Length over which directions, and on both sides of a point curvatures are measured, in mm: the width of an artery."""
+STRAIGHT_PER_MM: Final = 1e-4
+"""Curvature of an artery that is straight, in 1/mm: no radius is larger than 10 m."""
 STEP_MM: Final = 0.5
 """Length of a piece of the beam, in mm."""
 AGREED_MM: Final = 0.05
@@ -87,21 +91,67 @@ class Straightening:
         }
 
 
-def described(measures: Mapping[str, Any]) -> str:
-    """Return the metrics of a straightening as sentences; a band that is wider than the effect comes first."""
-    value, low, high = (
-        round(float(np.degrees(measures[f"straightened{end}_rad"])), 1) + 0.0 for end in ("", "_low", "_high")
-    )
+class Bend(NamedTuple):
+    """The axis of an artery with devices in it."""
+
+    rest: Beam
+    """The artery without devices."""
+    stiffness_N_mm2: Floats
+    """(3, n) stiffness of the devices relative to that of wall and bed: as likely, lowest and highest."""
+    ends_mm: tuple[float, float]
+    """Where the devices begin and end on the axis."""
+    moved_mm: Floats
+    """(n, 3) nodes in equilibrium."""
+
+    @classmethod
+    def of(
+        cls, rest: Beam, stents: Sequence[Stent], setting: str, place: float = 0.0, start_mm: Floats | None = None
+    ) -> "Bend":
+        """Return the axis with devices in it, from nodes (n, 3); setting and place are those of `straighten`."""
+        ends_mm = min(one.proximal_abscissa_mm for one in stents), max(one.distal_abscissa_mm for one in stents)
+        likely, low, high = stiffness = _relative(rest, _device(rest, stents), ends_mm, read_straightening(setting))
+        at = likely + abs(place) * ((high if place > 0 else low) - likely)
+        return cls(rest, stiffness, ends_mm, settled(rest, at, rest.rest_mm if start_mm is None else start_mm))
+
+    def numbers(self) -> dict[str, Any]:
+        """Return the numbers of `Straightening` by the name of their field."""
+        rest, (likely, *others), moved_mm = self.rest, self.stiffness_N_mm2, self.moved_mm
+        shapes = [rest.rest_mm, moved_mm]
+        shapes += [moved_mm if (one == likely).all() else settled(rest, one, moved_mm) for one in others]
+        angle_rad, radius_mm = np.array([measured(one, self.ends_mm) for one in shapes]).T
+        return {
+            "angle_rad": angle_rad,
+            "radius_mm": radius_mm[:2],
+            "displacement_mm": float(curves.lengths(moved_mm - rest.rest_mm).max()),
+            "axis_length_change_fraction": float(
+                curves.arc_length(moved_mm)[-1] / curves.arc_length(rest.rest_mm)[-1] - 1
+            ),
+        }
+
+
+def described(measures: Mapping[str, Any], intervals: Mapping[str, Mapping[str, float]] = MappingProxyType({})) -> str:
+    """Return the metrics of a straightening as sentences; a band that is wider than the effect comes first.
+
+    The bands are the intervals of an uncertainty study, where it has them.
+    """
+    varied = intervals.get("straightened_rad", {end: measures[f"straightened_{end}_rad"] for end in ("low", "high")})
+    found_rad = measures["straightened_rad"], varied["low"], varied["high"]
+    value, low, high = (round(float(np.degrees(one)), 1) + 0.0 for one in found_rad)
     first = "The band is wider than the effect. " if high - low > abs(value) else ""
     band = f" ({low:.0f} to {high:.0f})" if high > low else ""
     before_mm, after_mm = measures["bend_radius_before_mm"], measures["bend_radius_after_mm"]
+    radius = intervals.get("bend_radius_after_mm")
+    to_mm = f" ({radius['low']:.1f} to {radius['high']:.1f})" if radius else ""
     return (
         f"{first}The artery opens by {value:.1f} degrees{band}, the radius of its sharpest bend changes from "
-        f"{before_mm:.1f} to {after_mm:.1f} mm, and its axis moves by up to {measures['axis_displacement_mm']:.1f} mm."
+        f"{before_mm:.1f} to {after_mm:.1f}{to_mm} mm, and its axis moves by up to "
+        f"{measures['axis_displacement_mm']:.1f} mm."
     )
 
 
-def straighten(anatomy: Anatomy, deployed: Sequence[Deployment], setting: str = "immediate") -> Straightening:
+def straighten(
+    anatomy: Anatomy, deployed: Sequence[Deployment], setting: str = "immediate", place: float = 0.0
+) -> Straightening:
     """Let an artery yield to the devices in it, and deploy these again in the artery that has yielded until both agree.
 
     Parameters
@@ -113,6 +163,8 @@ def straighten(anatomy: Anatomy, deployed: Sequence[Deployment], setting: str = 
     setting : str, optional
         ``immediate`` or ``six_months`` after treatment; or what was measured: the angle by which the artery opens, such
         as ``12deg``, or the radius of its sharpest bend afterwards, such as ``10.7mm``.
+    place : float, optional
+        Where the stiffness of the device relative to wall and bed lies in its range: -1 is the lowest, 1 the highest.
 
     Returns
     -------
@@ -132,41 +184,34 @@ def straighten(anatomy: Anatomy, deployed: Sequence[Deployment], setting: str = 
     branches. A device is a beam that is at rest when straight. Every section of the vessel moves with the axis as a
     rigid body, and so does every sac and branch with its neck.
     """
-    stents = [one.stent for one in deployed if one.stent.design.kind in ("braid", "laser_cut")]
-    if len({stent.path for stent in stents}) > 1:
-        raise LandingError("Straightening is computed for devices on one path: leave it out for stents at a fork.")
-    if not stents:
-        raise LandingError("Nothing straightens the artery: coils and devices in sacs have no stiffness along it.")
+    stents = stiff([one.stent for one in deployed])
     first = anatomy.parent.name
     anatomy = on_path(anatomy, stents[0].path)
     rest, yielded, again = artery_beam(anatomy), anatomy, tuple(deployed)
-    moved_mm = rest.rest_mm
+    moved_mm, skin = rest.rest_mm, Skin(anatomy, rest.rest_mm)
     for done in range(ROUNDS):
-        given = _device(rest, stents)
-        ends_mm = min(one.proximal_abscissa_mm for one in stents), max(one.distal_abscissa_mm for one in stents)
-        share = _shares(rest, given[0], ends_mm, read_straightening(setting))
-        before_mm, moved_mm = moved_mm, settled(rest, share[0] * given[0], moved_mm)
-        if np.abs(moved_mm - before_mm).max() < (AGREED_MM if done else np.nextafter(0.0, 1.0)):
-            moved_mm = before_mm
+        bend = Bend.of(rest, stents, setting, place, moved_mm)
+        if np.abs(bend.moved_mm - moved_mm).max() < (AGREED_MM if done else np.nextafter(0.0, 1.0)):
+            bend = bend._replace(moved_mm=moved_mm)
             break
-        motion = Motion.of(anatomy, rest.rest_mm, moved_mm)
-        yielded = moved(anatomy, motion)
+        moved_mm, motion = bend.moved_mm, Motion.of(skin, bend.moved_mm)
+        yielded = moved(motion)
         again = _deployed_again(deployed, anatomy, yielded, motion)
         stents = [_on(one.stent, anatomy, yielded) for one in again if not isinstance(one.stent, Coils)]
-    is_given = share[1] == share[2]
-    shapes = [rest.rest_mm, moved_mm]
-    shapes += [
-        moved_mm if is_given else settled(rest, a * b, moved_mm) for a, b in zip(share[1:], given[1:], strict=True)
-    ]
-    angle_rad, radius_mm = np.array([measured(one, ends_mm) for one in shapes]).T
-    return Straightening(
-        on_path(yielded, first),
-        again,
-        angle_rad,
-        radius_mm[:2],
-        float(curves.lengths(moved_mm - rest.rest_mm).max()),
-        float(curves.arc_length(moved_mm)[-1] / curves.arc_length(rest.rest_mm)[-1] - 1),
-    )
+    return Straightening(on_path(yielded, first), again, **bend.numbers())
+
+
+def stiff(stents: Sequence[Stent]) -> list[Stent]:
+    """Return the devices that straighten an artery; LandingError is raised for none, and for several paths."""
+    found = [one for one in stents if one.design.kind in ("braid", "laser_cut")]
+    if len({stent.path for stent in found}) > 1:
+        raise LandingError(
+            "Straightening is computed for devices on one path: at a fork each device pulls the artery towards its own "
+            "branch, and the balance of both is not modelled."
+        )
+    if not found:
+        raise LandingError("Nothing straightens the artery: coils and devices in sacs have no stiffness along it.")
+    return found
 
 
 def artery_beam(anatomy: Anatomy) -> Beam:
@@ -210,7 +255,7 @@ def measured(nodes_mm: Floats, ends_mm: tuple[float, float]) -> tuple[float, flo
     turn_rad = np.arctan2(np.linalg.norm(np.cross(first, last)), first @ last)
     curvature = curves.curvature_and_torsion(nodes_mm, OVER_MM)[0]
     is_along = (where_mm >= ends_mm[0]) & (where_mm <= ends_mm[1])
-    return float(np.pi - turn_rad), float(1 / curvature[is_along].max())
+    return float(np.pi - turn_rad), float(1 / max(curvature[is_along].max(), STRAIGHT_PER_MM))
 
 
 def _bending_N_mm2(radius_mm: Floats | float) -> Floats:
@@ -230,25 +275,23 @@ def _device(rest: Beam, stents: Sequence[Stent]) -> Floats:
     return found
 
 
-def _shares(rest: Beam, device: Floats, ends_mm: tuple[float, float], setting: str) -> tuple[float, float, float]:
-    """Return the stiffness of the device relative to its own (n,): as likely, lowest and highest."""
-    if setting == "off":
-        return 0.0, 0.0, 0.0
-    if setting in SETTINGS:
-        return SETTINGS[setting]
+def _relative(rest: Beam, device: Floats, ends_mm: tuple[float, float], setting: str) -> Floats:
+    """Return the likely, lowest and highest stiffness (3, n) of a device relative to that of wall and bed."""
+    if setting in ("off", *SETTINGS):
+        return np.array(SETTINGS.get(setting, (0.0, 0.0, 0.0)))[:, None] * device
     unit = setting.lstrip("0123456789.")
     which, value = ("deg", "mm").index(unit), float(setting.removesuffix(unit))
     before = measured(rest.rest_mm, ends_mm)[which]
     wanted = before + np.radians(value) if unit == "deg" else value
 
     def excess(share: float) -> float:
-        return measured(settled(rest, share * device, rest.rest_mm), ends_mm)[which] - wanted
+        return measured(settled(rest, share * device[0], rest.rest_mm), ends_mm)[which] - wanted
 
     reached, last = before, 0.0
     for share in TRIED:
         if (now := excess(share)) >= 0 >= before - wanted:
             share = float(brentq(excess, last, share, xtol=1e-3 * share)) if before < wanted else 0.0
-            return share, share, share
+            return np.tile(share * device[0], (3, 1))
         reached, last = max(reached, now + wanted), share
     if unit == "deg":
         raise InputError(f"The device opens this artery by at most {np.degrees(reached - before):.1f} degrees.")

@@ -33,8 +33,8 @@ LEAST_ACROSS, ACROSS = 2.0, 4.0
 """Number of cells that a wire taken as a wall needs across, and that its drag needs for an error of at most 5 %."""
 WALL = 0
 """Patch number of the wall; opening k has patch number k + 1."""
-BEYOND = -1
-"""Patch number where the blood continues outside a window."""
+LEAST_PIECE = 64
+"""Number of cells of the smallest separate piece of a window that is computed."""
 BACK_TO_BACK = -0.5
 """Largest cosine between the normals of two walls that separate two blood cells. A corner that a link only clips
 does not separate them: bounce-back there would deflect a jet that leaves the edge (13 links, 3 % of the peak
@@ -58,8 +58,7 @@ class Domain(Cells):
     link_fraction: Floats
     """(l,) position where the link meets the surface, as a fraction of its length."""
     link_patch: Ints
-    """(l,) patch that the link meets: 0 wall, k + 1 opening k; in a window other numbers where the blood continues
-    beyond it."""
+    """(l,) patch that the link meets: 0 wall, k + 1 opening k."""
     septum_cell: Ints
     """(s,) blood cell on one side of a wall thinner than a cell, with a blood cell on the other side."""
     septum_direction: Ints
@@ -205,7 +204,7 @@ def mean_diameter_mm(vessel: Vessel) -> float:
 
 
 def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None, wires: Surface | None = None) -> Domain:
-    """Discretize the blood of a vessel on a regular grid: all that is connected to the inlet, or the most in a window.
+    """Discretize the blood of a vessel on a regular grid: all that is connected to the inlet, or what is in a window.
 
     `wires` are closed solids in it, which may overlap. A grid too coarse for the vessel, or to reach another inlet, is
     refused.
@@ -226,9 +225,9 @@ def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None, wir
         inside = _connected(filled, vessel, sections[0], origin_mm, cell_size_mm)
     else:
         label, _ = ndimage.label(filled & window.mask)
-        inside = label == 1 + np.bincount(label.ravel())[1:].argmax()
+        inside = (np.bincount(label.ravel()) >= LEAST_PIECE)[label] & (label > 0)
     cells = np.argwhere(inside).astype(np.int32)
-    if len(cells) < MIN_CELLS:
+    if window is None and len(cells) < MIN_CELLS:
         raise CoarseGridError(
             f"at a grid spacing of {cell_size_mm:.3g} mm only {len(cells)} cells are connected to the inlet at "
             f"{place(vessel.inlet.center_mm)}, so the grid is too coarse or the inlet is blocked: use a finer grid "
@@ -236,9 +235,7 @@ def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None, wir
         )
     grid = Cells(cells, origin_mm, cell_size_mm)
     neighbour = grid.neighbours()
-    is_beyond = filled & ~inside & (window is not None)
-    if window is not None and wires is not None:
-        is_beyond &= ~window.mask  # blood enclosed by wires is no part of the vessel's continuation
+    is_beyond = filled & (False if window is None else ~window.mask)
     links = _links(surface, face_patch, neighbour, grid, is_beyond, wires, lumen & ~filled)
     for patch, opening in enumerate(vessel.openings, start=1):
         # An outlet without cells only causes a warning (see `unreached`).
@@ -374,7 +371,8 @@ def _links(
 ) -> tuple[Ints, Ints, Floats, Ints, Bools]:
     """Return the links that leave the blood: cell, direction, fraction to a wall, patch, and whether that is a wire.
 
-    The masks are the cells of blood beyond a window, and those in wires and the gaps closed at them.
+    The masks are the cells of blood beyond a window, to which no links lead, and those in wires and the gaps closed at
+    them.
     """
     cell, direction = np.nonzero(neighbour < 0)
     starts, step_mm = grid.centers_mm[cell], VELOCITIES[direction] * grid.cell_size_mm
@@ -387,9 +385,10 @@ def _links(
     is_wire = np.where(is_missed, is_taken[ahead], to_wire < to_lumen)
     fraction = np.clip(np.where(is_missed, 0.5, fraction), 1e-3, 1.0)
     _, _, face = surface.closest(starts + fraction[:, None] * step_mm)
-    patch = np.where(is_missed, np.where(is_beyond[ahead], BEYOND, WALL), face_patch[face])
-    patch[is_wire] = WALL
-    return cell.astype(np.int32), direction.astype(np.int32), fraction, patch.astype(np.int32), is_wire
+    patch = np.where(is_missed | is_wire, WALL, face_patch[face])
+    links = cell.astype(np.int32), direction.astype(np.int32), fraction, patch.astype(np.int32), is_wire
+    ends = ~(is_missed & is_beyond[ahead])
+    return links[0][ends], links[1][ends], links[2][ends], links[3][ends], links[4][ends]
 
 
 def septa(surface: Surface, neighbour: Ints, grid: Cells, *, of_wires: bool = False) -> tuple[Ints, Ints]:

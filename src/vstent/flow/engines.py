@@ -68,16 +68,12 @@ class AbstractEngine(ABC, Generic[State]):
     """The engine's own folder for this run, which may not exist yet. The engine may resume from files of the same
     run there. None: no folder is available."""
 
-    outer: FlowField | None = None
-    """Flow in the whole vessel on a coarser grid, if only the refined sac is to be computed; None: the whole vessel
-    is."""
-
     coarsening: ClassVar[float | None] = None
     """Grid spacing of the coarse run that provides a first guess, over that of the result; None: no coarse run."""
     refined_by: ClassVar[tuple[str, ...]] = ("cell_size_mm",)
     """Settings whose reduction makes the result converge; the grid spacing comes first."""
-    closes_up: ClassVar[bool] = False
-    """Whether the engine can compute a refined sac inside an `outer` flow."""
+    has_levels: ClassVar[bool] = False
+    """Whether the engine supports a finer grid in a part of the vessel (`Numerics.close_up`)."""
     runs_on_gpu: ClassVar[bool] = False
     """Whether the engine supports the setting ``device_gpu``."""
 

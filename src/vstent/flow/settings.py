@@ -128,7 +128,7 @@ class Numerics:
     close_up: bool = setting(
         False, "refine-sac", "use the grid spacing only in and near the sac, and twice it elsewhere", flag
     )
-    """Whether to use this grid spacing only in and near the sac, and twice it elsewhere (see `lattice.close_up`)."""
+    """Whether to use this grid spacing only in and near the sac, and twice it elsewhere (see `lattice.levels`)."""
     resolve_wires: bool = setting(
         False, "resolve-wires", "take wires over necks and branches as walls of the flow grid, not as a screen", flag
     )
@@ -143,17 +143,15 @@ class Numerics:
     and the velocity in the sac by less than twice this fraction (root mean square). An unsteady flow has converged
     when the standard error of every time average is smaller than this fraction."""
     max_steps: int = 96_000
-    """Maximum number of time steps of a steady flow on the fine grid. With `close_up`, the refined part makes at
-    most a quarter of them and the surrounding flow at most half."""
+    """Maximum number of time steps of a steady flow on the finest grid. With `close_up` at most a third of them."""
     max_cycles: int = 4
     """Maximum number of cycles of a pulsatile flow."""
     cycle_tolerance: float = 0.02
     """A pulsatile flow has converged when two consecutive cycles differ by less than this fraction (root mean
     square)."""
     lattice_speed: float = 0.15
-    """Peak speed in cells per time step. It sets the time step, which is a third longer in a steady refined sac
-    (`close_up`). In steady flow it affects the result through the relaxation times, that is through the spatial
-    error, not through the error in time."""
+    """Peak speed in cells per time step. It sets the time step. In steady flow it affects the result through the
+    relaxation times, that is through the spatial error, not through the error in time."""
     engine: str = setting(
         LATTICE, "engine", "flow engine: lattice_boltzmann, openfoam, or a plug-in", str, metavar="NAME"
     )

@@ -16,10 +16,9 @@ from vstent.devices.stent import Deployment
 from vstent.errors import InputError, PluginError
 from vstent.flow import sampling
 from vstent.flow.background import BackgroundWork
-from vstent.flow.case import FlowCase, FlowField, Level, Phase, Target
+from vstent.flow.case import FlowCase, FlowField, Level, Phase
 from vstent.flow.domain import MIN_CELLS, CoarseGridError, default_cell_size_mm
 from vstent.flow.engines import AbstractEngine, DivergenceError, Progress, Saved, run
-from vstent.flow.lattice.close_up import SHARE_AROUND, WIDTH, require_sac
 from vstent.flow.lattice.gpu import require_gpu
 from vstent.flow.measured import MeasuredProfile
 from vstent.flow.problem import flow_case
@@ -28,9 +27,6 @@ from vstent.geometry.vessel import Anatomy
 
 COARSE_SHARE = 0.12
 """Assumed share of the run time of each coarse run, for the progress."""
-
-OUTER_SHARE = 0.35
-"""Assumed share of the run time of the flow around a refined sac, for the progress."""
 
 CALMER_TRIES = 3
 """Maximum number of retries of a diverged run, each with a shorter time step."""
@@ -157,10 +153,15 @@ def engine_class(numerics: Numerics, *, is_pulsatile: bool) -> type[AbstractEngi
             f"The engine {numerics.engine} is incomplete: it lacks {', '.join(sorted(missing))}. Complete its package, "
             f"or choose the engine {LATTICE}."
         )
-    if numerics.close_up and not engine.closes_up:
+    if numerics.close_up and not engine.has_levels:
         raise InputError(
             f"the engine {numerics.engine} does not support a finer grid in the sac alone: switch it off "
             f"(--refine-sac), or choose the engine {LATTICE}"
+        )
+    if numerics.close_up and numerics.device_gpu:
+        raise InputError(
+            "a finer grid in the sac alone is not computed on a GPU: leave out --refine-sac, or compute on the CPU "
+            "(without --gpu)"
         )
     if numerics.device_gpu and not engine.runs_on_gpu:
         raise InputError(
@@ -210,27 +211,13 @@ class _Runs:
     """Flow with a similar stent, from which the whole vessel starts."""
 
     def answer(self, case: FlowCase, start: FlowField | None) -> FlowField:
-        """Compute a flow; of a refined sac first that of the whole vessel on a coarse grid."""
-        size_mm = default_cell_size_mm(case)
-        if not case.numerics.close_up:
-            return self._from_coarser(case, size_mm, start, "answer")
-        target = Target(require_sac(case), None)
-        steps = int(SHARE_AROUND * case.numerics.max_steps)
-        # Without the ostium: oscillations at the neck would need most of the steps, and the fine grid recomputes them.
-        around = replace(case, target=target, numerics=replace(case.numerics, max_steps=steps))
-        first = replace(self, progress=self._part(0.0, OUTER_SHARE))
-        outer = first._from_coarser(around, WIDTH * size_mm, start, "outer")
-        # The mean of an unsteady flow lacks its oscillations: from it C0038's averages take longer than from `outer`.
-        guess = outer if self.similar is None or self.similar.mean_shear_Pa is not None else self.similar
-        return self._run("answer", case, size_mm, lambda: guess, (OUTER_SHARE, 1.0), outer)
-
-    def _from_coarser(self, case: FlowCase, size_mm: float, start: FlowField | None, name: str) -> FlowField:
         """Compute a flow from a first guess on coarser grids, each of which starts from the next coarser one.
 
         Every run is begun only where a finer one needs its result; a finer one that is resumed does not. If the flow
         without a device is known, a coarse grid only provides the change due to the screen (see `_guess`).
         """
-        sizes_mm, coarsening = [size_mm], self.engine.coarsening
+        sizes_mm, coarsening = [default_cell_size_mm(case)], self.engine.coarsening
+        whole = replace(case, numerics=replace(case.numerics, close_up=False))  # a guess has one level
         if coarsening is not None and self.similar is None and (start is None or case.media):
             volume_mm3 = abs(case.vessel.closed.volume_mm3)
             while volume_mm3 >= 4 * MIN_CELLS * (coarsening * sizes_mm[-1]) ** 3:
@@ -240,13 +227,13 @@ class _Runs:
         bare: list[Guess] = [lambda: start]
         for depth, coarse_mm in enumerate(sizes_mm[1:], start=1):
             part = (0.0, share) if depth == 1 else None
-            bare.append(cache(partial(self._bare, f"bare {depth}", case, coarse_mm, bare[-1], part)))
+            bare.append(cache(partial(self._bare, f"bare {depth}", whole, coarse_mm, bare[-1], part)))
         guess = bare[-1]
         for depth in range(len(sizes_mm) - 1, 0, -1):
             part = ((runs - 1) * share, runs * share) if depth == 1 else None
-            run_ = partial(self._run, f"guess {depth}", case, sizes_mm[depth], guess, part)
+            run_ = partial(self._run, f"guess {depth}", whole, sizes_mm[depth], guess, part)
             guess = cache(partial(_guess, bare[depth - 1], bare[depth], run_))
-        return self._run(name, case, size_mm, guess, (runs * share, 1.0))
+        return self._run("answer", case, sizes_mm[0], guess, (runs * share, 1.0))
 
     def _bare(self, name: str, case: FlowCase, size_mm: float, finer: Guess, part: Part) -> FlowField | None:
         """Return the flow without a device on a coarse grid, from a finer one and computed only once; None without."""
@@ -259,19 +246,16 @@ class _Runs:
             done[key] = self._run(name, replace(case, media=(), solids=()), size_mm, finer, part)
         return done[key]
 
-    def _run(
-        self, name: str, case: FlowCase, size_mm: float, guess: Guess, part: Part, outer: FlowField | None = None
-    ) -> FlowField:
+    def _run(self, name: str, case: FlowCase, size_mm: float, guess: Guess, part: Part) -> FlowField:
         """Run an engine from a guess or a saved state; after divergence start again with the engine's calmer case."""
-        engine = self.engine(size_mm, self.folder if name == "answer" else self.folder / name, outer)
+        engine = self.engine(size_mm, self.folder if name == "answer" else self.folder / name)
         guess, checkpoint = cache(partial(_guessed, engine, case, guess)), self.checkpoint
         saved = None if checkpoint is None else checkpoint.load(name)
         save = None if checkpoint is None else partial(checkpoint.save, name)
         progress = None if part is None else self._part(*part)
         tries = 0
         while True:
-            first = guess() if saved is None else None
-            start = None if first is None else sampling.uniform(first)
+            start = guess() if saved is None else None
             try:
                 return run(engine, case, start=start, progress=progress, saved=saved, save=save)
             except DivergenceError:
@@ -317,27 +301,29 @@ def _guess(start: Guess, bare: Guess, stented: Callable[[], FlowField]) -> FlowF
     fine = start()
     with suppress(DivergenceError, CoarseGridError):
         coarse = bare()
-        return stented() if fine is None or coarse is None else _corrected(sampling.uniform(fine), coarse, stented())
+        return stented() if fine is None or coarse is None else _corrected(fine, coarse, stented())
     return fine
 
 
 def _corrected(start: FlowField, bare: FlowField, stented: FlowField) -> FlowField:
     """Return a bare flow plus the change due to a screen on a coarser grid; if pulsatile, mean and last phase."""
-    fields = start, bare, stented
-    level = _changed(*fields)
+    levels = _changed(start, bare, stented)
     phases: tuple[Phase, ...] = ()
-    if all(field.phases for field in fields):
-        end = _changed(*(field.at_phase(field.phases[-1]) for field in fields))
-        phases = (replace(start.phases[-1], velocity_m_s=(end.velocity_m_s,), pressure_Pa=(end.pressure_Pa,)),)
-    return replace(start, levels=(level,), phases=phases, mean_shear_Pa=None, neck_inflow_mL_s=None)
+    if start.phases and bare.phases and stented.phases:
+        end = _changed(*(field.at_phase(field.phases[-1]) for field in (start, bare, stented)))
+        values = tuple(one.velocity_m_s for one in end), tuple(one.pressure_Pa for one in end)
+        phases = (replace(start.phases[-1], velocity_m_s=values[0], pressure_Pa=values[1]),)
+    return replace(start, levels=levels, phases=phases, mean_shear_Pa=None, neck_inflow_mL_s=None)
 
 
-def _changed(start: FlowField, bare: FlowField, stented: FlowField) -> Level:
-    """Return a flow plus the difference between two flows on a coarser grid."""
-    grid = start.finest
-    before, after = (sampling.values_at(field, grid.centers_mm) for field in (bare, stented))
-    speed_before, speed_after = (np.linalg.norm(values[0], axis=1, keepdims=True) for values in (before, after))
-    left = np.clip(speed_after / np.maximum(speed_before, 1e-9), 0.0, 1.0)
-    velocity_m_s = after[0] + left * (grid.velocity_m_s - before[0])
-    pressure_Pa = grid.pressure_Pa + after[1] - before[1]
-    return replace(grid, velocity_m_s=velocity_m_s, pressure_Pa=pressure_Pa, mean_speed_m_s=None)
+def _changed(start: FlowField, bare: FlowField, stented: FlowField) -> tuple[Level, ...]:
+    """Return the levels of a flow plus the difference between two flows on a coarser grid."""
+    levels = []
+    for grid in start.levels:
+        before, after = (sampling.values_at(field, grid.centers_mm) for field in (bare, stented))
+        speed_before, speed_after = (np.linalg.norm(values[0], axis=1, keepdims=True) for values in (before, after))
+        left = np.clip(speed_after / np.maximum(speed_before, 1e-9), 0.0, 1.0)
+        velocity_m_s = after[0] + left * (grid.velocity_m_s - before[0])
+        pressure_Pa = grid.pressure_Pa + after[1] - before[1]
+        levels.append(replace(grid, velocity_m_s=velocity_m_s, pressure_Pa=pressure_Pa, mean_speed_m_s=None))
+    return tuple(levels)

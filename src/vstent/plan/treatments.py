@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from vstent.deployment.coverage import UNION
 from vstent.devices.treatment import BARE
-from vstent.flow.grade import unusable
+from vstent.flow.grade import NOT_USABLE, unusable
 from vstent.plan.criteria import Criteria, parse
 from vstent.plan.rank import graded
 
@@ -55,7 +55,7 @@ def rank_treatments(treatments: Mapping[str, Any]) -> list[dict[str, Any]]:
             told = {"treatment": name, "score": 0.0, "is_suitable": False, "reason": reason}
             rows.append(told | {"jailed_branches": {}})
             continue
-        implants, both = treatment["implants"].values(), treatment.get("straightening", {}).get("change", {})
+        implants, both = treatment["implants"].values(), treatment.get("straightening", {})
         measures = {key: change[ratio] - 1 for key, ratio in FLOWS.items() if ratio in change}
         if (coverage := treatment.get("together", {}).get(UNION)) is not None:
             measures["neck_coverage_fraction"] = coverage
@@ -70,8 +70,8 @@ def rank_treatments(treatments: Mapping[str, Any]) -> list[dict[str, Any]]:
         }
         if jailed:
             measures["worst_branch_change_fraction"] = min(jailed.values())
-        if "mean_sac_velocity_m_s_ratio" in both:
-            measures[STRAIGHTENED] = both["mean_sac_velocity_m_s_ratio"] - 1
+        if "change" in both and both["quality"]["grade"] != NOT_USABLE:
+            measures[STRAIGHTENED] = both["change"]["mean_sac_velocity_m_s_ratio"] - 1
         grades, score, reason = graded(treatment_criteria().items, measures)
         told = {"score": score, "is_suitable": all(grades.values()), "reason": reason}
         rows.append({"treatment": name} | told | measures | {"jailed_branches": jailed})

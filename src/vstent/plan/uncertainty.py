@@ -2,12 +2,14 @@
 
 Four causes are varied, each uniformly within plus or minus its range and independently of the others: the threshold of
 the scan (all diameters), the landing position, the manufactured diameter of the device, and the mean inflow. The
-numbers of the device vary with them, each within its range in the catalogue (`vstent.devices.ranges`). Points are those
-of a Sobol sequence, each in the middle of its stratum. Every cause alone is thus sampled evenly, and
-the same study gives the same result. Every sample of coils has a seed of its own; of coils alone nothing else varies.
+numbers of the device vary with them, each within its range in the catalogue (`vstent.devices.ranges`). In an artery
+that yields, so does the stiffness of the device relative to wall and bed. Points are those of a Sobol sequence, each in
+the middle of its stratum. Every cause alone is thus sampled evenly, and the same study gives the same result. Every
+sample of coils has a seed of its own; of coils alone nothing else varies.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Final
@@ -17,6 +19,7 @@ import numpy as np
 from vstent.deployment.coils import deploy_coils
 from vstent.deployment.deploy import deploy
 from vstent.deployment.measure import measure
+from vstent.deployment.straightening import SETTINGS, Straightening, straighten
 from vstent.devices.design import Design, Size
 from vstent.devices.ranges import altered, values_at
 from vstent.devices.stent import Coils, Deployment, Landing, Stent
@@ -54,6 +57,14 @@ FLOW_RESULTS: Final = (
     "mean_sac_wss_Pa_ratio",
 )
 """Ratios of the flow with to the flow without the device for which intervals are computed."""
+STRAIGHTENED: Final = ("straightened_rad", "bend_radius_after_mm")
+"""Measures of the straightening for which intervals are computed."""
+OF_EFFECTS: Final = ("neck_inflow_mL_s_ratio", "mean_sac_velocity_m_s_ratio")
+"""Flow ratios that are computed in the artery that has yielded, relative to the artery as scanned without a device."""
+EFFECTS: Final = "straightened_bare_", "straightened_"
+"""What the names of these begin with: without and with the device."""
+STIFFNESS: Final = "stiffness_to_wall"
+"""Name of the stiffness of the device relative to wall and bed."""
 WIDEST_FRACTION: Final = 0.1
 """Fraction of the free diameter below which the range of the device's diameter must be."""
 INTERVAL: Final = (0.025, 0.975)
@@ -73,7 +84,7 @@ class Uncertainty:
     values: Floats
     """(n, k) results; NaN if the device did not fit or the flow was not computed."""
     numbers: tuple[str, ...] = ()
-    """(d) numbers of the device that were varied."""
+    """(d) numbers of the device that were varied, then `STIFFNESS` where the artery yields by a range."""
     neck_mm2: tuple[float, float, float] | None = None
     """Area of the section by the neck plane, and the smallest and largest one by planes that separate the sac nearly as
     well; None without a neck plane."""
@@ -143,19 +154,23 @@ def vary(
     coils: Sequence[Stent] = (),
     *,
     flow: FlowSettings | None = None,
+    straightening: str = "off",
     progress: Callable[[int, int], None] | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Uncertainty:
     """Repeat a deployment with its causes varied: artery, position of the middle row, size and numbers of the device.
 
-    The same `coils` that it keeps in the sac are placed behind every sample, each time with another seed.
+    The same `coils` that it keeps in the sac are placed behind every sample, each time with another seed. The artery
+    yields to the devices as `straightening` states (`straighten`), off: it is rigid.
+
     The first ``ranges.flow_samples`` samples are computed with a flow of these settings and stored in `checkpoint`, so
     that an interrupted study resumes after the last of them. `progress` is called with the number of finished samples
     and the number of all. An InputError says that the range of the threshold would close the artery, or that of the
     device is too large for its diameter.
     """
     spread, numbers = ranges.of(anatomy), ranges.numbers_of(deployment.stent.design)
-    points = centered_points(len(CAUSES) + len(numbers), ranges.samples)
+    yields = (STIFFNESS,) if straightening in SETTINGS else ()
+    points = centered_points(len(CAUSES) + len(numbers) + len(yields), ranges.samples)
     if 2 * spread[0] > anatomy.parent.section_radius_mm.min():
         raise InputError(
             f"diameters that vary by {spread[0]:.2g} mm would close the artery: give a smaller range of the threshold"
@@ -168,14 +183,14 @@ def vary(
         )
 
     def sample(number: int, wanted: FlowSettings | None) -> dict[str, float]:
-        made = values_at(numbers, points[number, len(CAUSES) :])
-        offset = points[number, : len(CAUSES)] * spread
+        offset, at, place = np.split(points[number], [len(CAUSES), len(CAUSES) + len(numbers)])
+        how, made = (straightening, float(place.sum())), values_at(numbers, at)
         again = [replace(one, seed=one.seed + number) for one in coils if isinstance(one, Coils)]
-        return _sample(anatomy, deployment.stent, offset, made, again, wanted)
+        return _sample(anatomy, deployment.stent, offset * spread, made, again, wanted, how)
 
     names, values = _results(sample, len(points), ranges, flow, progress, checkpoint)
-    half = [0.5 * (one.high - one.low) for one in numbers]
-    told = tuple(one.name for one in numbers)
+    half = [*(0.5 * (one.high - one.low) for one in numbers), *(1.0 for _ in yields)]
+    told = *(one.name for one in numbers), *yields
     plane = anatomy.aneurysms[0].plane if anatomy.aneurysms else None
     neck_mm2 = None if plane is None else (plane.area_mm2, *plane.area_band_mm2)
     return Uncertainty(np.append(spread, half), points, names, values, told, neck_mm2)
@@ -199,7 +214,10 @@ def vary_seeds(
     def sample(number: int, wanted: FlowSettings | None) -> dict[str, float]:
         placed = deploy_coils(coils.design.key, anatomy, coils.coils, seed=coils.seed + number)
         found = _found(anatomy, placed)
-        return found if wanted is None else found | _changes(anatomy, bare(wanted), [placed.stent], wanted)
+        if wanted is None:
+            return found
+        changes = ratios(*_flows(anatomy, [placed], wanted, bare(wanted)))
+        return found | {name: changes[name] for name in FLOW_RESULTS if name in changes}
 
     names, values = _results(sample, ranges.samples, ranges, flow, progress, checkpoint)
     return Uncertainty(np.zeros(len(CAUSES)), np.zeros((len(values), len(CAUSES))), names, values)
@@ -226,7 +244,9 @@ def _results(
         rows.append(stored)
         if progress is not None:
             progress(number + 1, count)
-    names = tuple(name for name in (*RESULTS, *COIL_RESULTS, *FLOW_RESULTS) if any(name in row for row in rows))
+    of_effects = (f"{effect}{name}" for name in OF_EFFECTS for effect in EFFECTS)
+    known = *RESULTS, *COIL_RESULTS, *STRAIGHTENED, *FLOW_RESULTS, *of_effects
+    names = tuple(name for name in known if any(name in row for row in rows))
     values = np.array([[row.get(name, np.nan) for name in names] for row in rows], dtype=np.float64)
     return names, values.reshape(count, len(names))
 
@@ -250,8 +270,12 @@ def _sample(
     made: Mapping[str, float],
     coils: Sequence[Coils],
     flow: FlowSettings | None,
+    how: tuple[str, float],
 ) -> dict[str, float]:
-    """Return the results with causes changed by `offset` (4,) and numbers `made`; empty if a device does not fit."""
+    """Return the results with causes changed by `offset` (4,) and numbers `made`; empty if a device does not fit.
+
+    `how` states how the artery yields: `setting` and `place` of `straighten`.
+    """
     diameter_mm, along_mm, wider_mm, inflow_fraction = (float(value) for value in offset)
     other = widened(anatomy, diameter_mm) if diameter_mm else anatomy
     try:
@@ -263,12 +287,23 @@ def _sample(
     except (DeviceError, LandingError):
         return {}
     found = {name: value for one in placed for name, value in _found(other, one).items()}
+    yielded: Straightening | None = None
+    if how[0] != "off":
+        with suppress(InputError):  # such as an angle that this artery does not reach
+            yielded = straighten(other, placed, *how)
+            found |= {name: yielded.metrics()[name] for name in STRAIGHTENED}
     if flow is None or not other.aneurysms:
         return found
     inflow_mL_s = flow_case(anatomy, (), flow).inflow_mL_s * (1 + inflow_fraction)
     flow = replace(flow, inflow_mL_s=inflow_mL_s, inlet_speed_m_s=None)
-    bare = simulate_case(flow_case(other, (), flow))
-    return found | _changes(other, bare, [one.stent for one in placed], flow)
+    bare, after = _flows(other, placed, flow)
+    changes = ratios(bare, after)
+    found |= {name: changes[name] for name in FLOW_RESULTS if name in changes}
+    if yielded is not None:
+        for effect, one in zip(EFFECTS, _flows(yielded.anatomy, yielded.deployed, flow), strict=True):
+            changes = ratios(bare, one)
+            found |= {f"{effect}{name}": changes[name] for name in OF_EFFECTS if name in changes}
+    return found
 
 
 def _found(anatomy: Anatomy, placed: Deployment) -> dict[str, float]:
@@ -277,10 +312,13 @@ def _found(anatomy: Anatomy, placed: Deployment) -> dict[str, float]:
     return {name: float(measures[name]) for name in names if name in measures}
 
 
-def _changes(anatomy: Anatomy, bare: FlowField, stents: Sequence[Stent], flow: FlowSettings) -> dict[str, float]:
-    """Return the ratios of the flow with devices to that without for which intervals are computed."""
-    shapes, density = sac_surfaces(anatomy), sum(one.density_fraction for one in stents if isinstance(one, Coils))
+def _flows(
+    anatomy: Anatomy, placed: Sequence[Deployment], flow: FlowSettings, bare: FlowField | None = None
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the indices of the flow without devices, which is computed where it is not given, and with them."""
+    shapes, stents = sac_surfaces(anatomy), [one.stent for one in placed]
+    bare = bare or simulate_case(flow_case(anatomy, (), flow))
     after = indices(simulate_case(flow_case(anatomy, stents, flow), start=bare), *shapes)
+    density = sum(one.density_fraction for one in stents if isinstance(one, Coils))
     after = after if flow.numerics.resolve_wires else between_coils(after, 1.0 - density)
-    changes = ratios(indices(bare, *shapes), after)
-    return {name: changes[name] for name in FLOW_RESULTS if name in changes}
+    return indices(bare, *shapes), after

@@ -38,7 +38,7 @@ class Drawing:
     def begin(self, case: "Computed") -> Scene:
         """Begin to draw all pictures of what a study has computed, unless this has been done; return its scene."""
         if self._scene is None:
-            self._scene = scene_of(case.anatomy, case.implants, case.fields, case.straightened)
+            self._scene = scene_of(case.anatomy, case.implants, case.shown, case.yielded)
             self._begun = [self._pool.submit(plate.drawn) for plate in plates(self._scene)]
             of_method = method_plates(case.anatomy, case.implants, self._scene, case.whole)
             self._of_method = [self._pool.submit(plate.drawn) for plate in of_method]

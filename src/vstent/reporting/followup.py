@@ -19,7 +19,7 @@ def draw_followup(path: Path, anatomy: Anatomy, found: Followup) -> None:
     plot = figure.add_subplot(aspect="equal", xlabel="mm", ylabel="mm")
     walls_mm = found.pose.of(anatomy.vessel.lumen.vertices_mm), found.anatomy.vessel.lumen.vertices_mm
     for title, color, wall_mm, axis_mm in zip(
-        ("planned", "after treatment"), ("0.6", "C3"), walls_mm, axes_mm, strict=True
+        ("as scanned", "after treatment"), ("0.6", "C3"), walls_mm, axes_mm, strict=True
     ):
         plot.plot(*(wall_mm @ flat.T).T, ".", color=color, markersize=0.5, alpha=0.4)
         plot.plot(*(axis_mm @ flat.T).T, color=color, label=title)

@@ -19,7 +19,7 @@ class Quality(NamedTuple):
     """Grade of one flow in words."""
 
     name: str
-    """Name of the treatment."""
+    """Name of the treatment, and which of its flows where the artery yields."""
     title: str
     """What is graded, with the display name of the treatment."""
     grade: str
@@ -42,11 +42,19 @@ class Quality(NamedTuple):
 
 def qualities(metrics: Mapping[str, Any], titles: Mapping[str, str]) -> list[Quality]:
     """Return the grade of every flow that has one, the flow without a device first; `titles` are of treatments."""
-    graded = {name: one["quality"] for name, one in metrics.get("treatments", {}).items() if "quality" in one}
-    found = []
-    for name, title in ({BARE: ""} | dict(titles)).items():
-        if name in graded:
-            one, which = graded[name], f"Grid and convergence {f'with {title}' if title else 'without a device'}"
+    treatments, found = metrics.get("treatments", {}), []
+    flows = [(BARE, "without a device", treatments.get(BARE, {}))]
+    for name, title in titles.items():
+        treatment = treatments.get(name, {})
+        yielded = treatment.get("straightening", {})
+        flows += [
+            (name, f"with {title}", treatment),
+            (f"{name}, straightened", f"with {title} in the straightened artery", yielded),
+            (f"{name}, straightened, bare", f"without {title} in the straightened artery", yielded.get("bare", {})),
+        ]
+    for name, what, flow in flows:
+        if "quality" in flow:
+            one, which = flow["quality"], f"Grid and convergence {what}"
             spacing, inflow = (format_value(key, one[key]) for key in ("grid_spacing_mm", "inflow_mL_s"))
             inflow += f" ({60 * one['inflow_mL_s']:.0f} mL/min)"
             source = f", {one['inflow_source']}" if "inflow_source" in one else ""

@@ -53,6 +53,8 @@ MOST_RATIO = 10.0
 """Largest ratio of values that is shown as a percentage; above it the first value is near zero."""
 OPENING = re.compile(r"(inlet|outlet)_(\d+)_(\w+)")
 """Pattern of the key of a metric of one of several inlets or outlets."""
+YIELDED = {"straightened_bare_": "straightened, without device", "straightened_": "straightened, with device"}
+"""Prefixes of the keys of a flow in an artery that has yielded, and what is added to its name."""
 PREVIEW = "contrast_preview_error_fraction"
 """Key of the error of a preview. It is listed with the numbers that it concerns, without a change."""
 ERRORS = ("unsettled_fraction",)
@@ -140,6 +142,10 @@ def base_of(key: str) -> tuple[str, str]:
     """Return the key that defines a metric, and the text to append to its name."""
     if key in DEFINITIONS:
         return key, ""
+    for before, what in YIELDED.items():
+        if key.startswith(before) and key not in DEFINITIONS:
+            base, more = base_of(key.removeprefix(before))
+            return base, f"{more}, {what}"
     if key.endswith(RATIO):
         base, more = base_of(key.removesuffix(RATIO))
         return base, f"{more}, after / before"

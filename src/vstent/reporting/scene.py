@@ -1,13 +1,16 @@
 """Scene of a case: layers with colors, color scales and views, shared by the viewer and the pictures."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Final
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from vstent.anatomy.restore.paths import on_path
 from vstent.deployment.coverage import coverage_fractions
+from vstent.deployment.straightening import Straightening
 from vstent.devices.stent import Coils, Deployment, Stent
 from vstent.devices.treatment import BARE
 from vstent.flow.case import FlowField
@@ -152,8 +155,10 @@ class Scene:
         return next(view for view in self.views if view.id == name)
 
     def pick(self, ids: tuple[str, ...], pane: str) -> tuple[MeshLayer | LineLayer, ...]:
-        """Return the layers with these ids that `pane` shows."""
-        return tuple(layer for layer in self.layers if layer.id in ids and layer.pane in ("", pane))
+        """Return the layers with these ids that `pane` shows; its own replace those of all panes."""
+        own = {layer.id for layer in self.layers if layer.pane == pane}
+        panes = {layer.id: (pane,) if layer.id in own else ("", pane) for layer in self.layers}
+        return tuple(layer for layer in self.layers if layer.id in ids and layer.pane in panes[layer.id])
 
 
 Implants = Mapping[str, Mapping[str, Deployment]]
@@ -164,26 +169,31 @@ def scene_of(
     anatomy: Anatomy,
     implants: Implants,
     flows: Mapping[str, FlowField],
-    straightened: Mapping[str, Surface] | None = None,
+    yielded: Mapping[str, Straightening] = MappingProxyType({}),
 ) -> Scene:
-    """Return the scene of a case, decimated to the resolution of a screen; lumens that have yielded are faint."""
-    layers = anatomy_layers(anatomy)
-    layers += [straightened_layer(name, lumen) for name, lumen in (straightened or {}).items()]
-    deployments = [(name, one) for name, deployed in implants.items() for one in deployed.values()]
+    """Return the scene of a case, decimated to the resolution of a screen.
+
+    A treatment to which the artery has yielded is shown in that artery, with the flow in it.
+    """
+    layers, arteries = anatomy_layers(anatomy), {name: one.anatomy for name, one in yielded.items()}
+    for name, artery in arteries.items():
+        layers += own_layers(name, artery)
+    seen = {name: yielded[name].deployed if name in yielded else (*found.values(),) for name, found in implants.items()}
+    deployments = [(name, one) for name, deployed in seen.items() for one in deployed]
     for name, deployment in deployments:
         stent = deployment.stent
-        points, starts, _ = thin_lines(stent.wire_points_mm, stent.wire_starts, np.zeros(0), 60_000)
-        layers.append(LineLayer("wires", name, STEEL_COLOUR, points, starts, stent.wire_diameter_um / 2000))
+        layers.append(wire_layer(name, stent))
         if not isinstance(stent, Coils):
             coverage = 100 * node_coverage(stent).ravel()
-            layers.append(contour_layer(name, deployment, anatomy))
+            layers.append(contour_layer(name, deployment, arteries.get(name, anatomy)))
             layers.append(MeshLayer("coverage", name, STEEL_COLOUR, stent.contour, scale="coverage", values=coverage))
     for name, flow in flows.items():
-        layers += flow_layers(name, flow, anatomy)
+        layers += flow_layers(name, flow, arteries.get(name, anatomy))
+    titles = {name: treatment_title(deployed) for name, deployed in implants.items()}
     return Scene(
         panes=(
             (BARE, "Before (no device)"),
-            *((name, treatment_title(deployed)) for name, deployed in implants.items()),
+            *((name, f"{title}, artery straightened" if name in yielded else title) for name, title in titles.items()),
         ),
         layers=tuple(layers),
         scales=scales_of(layers, anatomy),
@@ -193,9 +203,15 @@ def scene_of(
     )
 
 
-def straightened_layer(name: str, lumen: Surface) -> MeshLayer:
-    """Return the layer of a lumen that has yielded to a treatment."""
-    return MeshLayer("straightened", name, NECK_COLOUR, thin_surface(lumen, 20_000)[0], 0.12)
+def own_layers(pane: str, anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
+    """Return the layers of an artery that has yielded to a treatment, which replace those as scanned in a pane."""
+    return [replace(one, pane=pane) for one in anatomy_layers(anatomy) if one.id in OWN]
+
+
+def wire_layer(name: str, stent: Stent) -> LineLayer:
+    """Return the wires of a device in one color."""
+    points, starts, _ = thin_lines(stent.wire_points_mm, stent.wire_starts, np.zeros(0), 60_000)
+    return LineLayer("wires", name, STEEL_COLOUR, points, starts, stent.wire_diameter_um / 2000)
 
 
 def device_title(deployment: Deployment) -> str:
@@ -227,6 +243,8 @@ def treatment_title(deployed: Mapping[str, Deployment]) -> str:
     return " + ".join(map(device_title, deployed.values()))
 
 
+OWN: Final = ("lumen", "neck", "axis")
+"""Layers that an artery that yields to a treatment has in its pane."""
 WALL_COLOUR = (0.62, 0.68, 0.73)
 NECK_COLOUR = (0.72, 0.20, 0.16)
 STEEL_COLOUR = (0.33, 0.38, 0.43)

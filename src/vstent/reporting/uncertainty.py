@@ -16,6 +16,7 @@ NUMBERS: Final = {
     "cell_angle_rad": "cell angle",
     "free_diameter_margin_mm": "free diameter",
     "label_length_mm": "length at the label diameter",
+    "stiffness_to_wall": "stiffness of the device relative to wall and bed",
 }
 """Display names of the numbers of the catalogue."""
 HEADLINES: Final = ("deployed_length_mm", "neck_metal_coverage_fraction")
@@ -29,6 +30,10 @@ CAUSES: Final = {
     "rest": "interplay and chance",
 }
 """Display names of the causes of uncertainty."""
+
+
+STIFFNESS: Final = "stiffness_to_wall"
+"""Name of the number that is varied where the artery yields."""
 
 
 class Row(NamedTuple):
@@ -161,8 +166,11 @@ def uncertainty_of(metrics: Mapping[str, Any], titles: Mapping[str, str]) -> lis
             for key, value in study["ranges"].items()
             if value > 0
         ]
-        if study.get("numbers"):
+        numbers = study.get("numbers", "").split(", ")
+        if any(name not in ("", STIFFNESS) for name in numbers):
             ranges.append("the numbers of the device within their ranges in the catalogue")
+        if STIFFNESS in numbers:
+            ranges.append(f"the {number_name(STIFFNESS)} within its range")
         if "packing_density_fraction" in study["intervals"]:
             ranges.append("the seed, which places the catheter and turns the framing coil")
         failed = f", of which {study['failed_count']} did not fit the artery" if study["failed_count"] else ""

@@ -1,6 +1,8 @@
 """Compare a case with a scan or surface of the same artery after the treatment: what was planned, what is there."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +28,13 @@ BESIDE_MM = 2.0
 WITHIN = 1.5
 """Largest distance of metal from the axis, in radii of the artery."""
 
+PREDICTED = {
+    "arms_angle_rad": "arms_angle_after_rad",
+    "bend_radius_mm": "bend_radius_after_mm",
+    "straightened_rad": "straightened_rad",
+}
+"""Numbers of an artery after the treatment, and the metrics of straightening that predict them."""
+
 
 class Followup(NamedTuple):
     """An artery after a treatment beside the one that was planned on."""
@@ -44,8 +53,17 @@ class Followup(NamedTuple):
         return {"registration": self.pose._asdict(), "planned": self.planned, "real": self.real}
 
 
-def compare_followup(anatomy: Anatomy, stent: Stent, path: Path, metal: float | None = None) -> Followup:
-    """Compare a planned device with a scan or surface; voxels from the intensity `metal` on are the real one."""
+def compare_followup(
+    anatomy: Anatomy,
+    stent: Stent,
+    path: Path,
+    metal: float | None = None,
+    predicted: Mapping[str, float] = MappingProxyType({}),
+) -> Followup:
+    """Compare a planned device with a scan or surface; voxels from the intensity `metal` on are the real one.
+
+    `predicted` are the metrics of the artery that was predicted to yield; without them a rigid one was planned.
+    """
     anatomy, vessel = on_path(anatomy, stent.path), read_vessel(path)
     first_pose = registered(anatomy.vessel.lumen.vertices_mm, vessel.lumen)
     pose = settled(_outside_mm(anatomy, stent), vessel.lumen, first_pose)
@@ -60,6 +78,8 @@ def compare_followup(anatomy: Anatomy, stent: Stent, path: Path, metal: float | 
     lines_mm = [curves.resample(line.points_mm, STEP_MM) for line in (axis, other)]
     shapes = measured(lines_mm[0], ends_mm), measured(lines_mm[1], after_mm)
     planned, real = (dict(zip(("arms_angle_rad", "bend_radius_mm"), one, strict=True)) for one in shapes)
+    real["straightened_rad"] = real["arms_angle_rad"] - planned["arms_angle_rad"]
+    planned |= {name: predicted.get(key, planned.get(name, 0.0)) for name, key in PREDICTED.items()}
     if metal is not None:
         radius_mm = 0.5 * stent.row_diameter_mm
         gap_mm = np.interp(stent.row_abscissa_mm, axis.abscissa_mm, anatomy.parent.section_radius_mm) - radius_mm

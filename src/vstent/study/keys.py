@@ -123,7 +123,8 @@ def study_keys(source: str, settings: "Settings") -> dict[str, Key]:
         for treatment in settings.treatments:
             if is_varied(treatment):
                 numbers = settings.uncertainty.numbers_of(find_design(treatment.devices[0]))
-                varied = [*deployed[treatment.name].values()], settings.uncertainty, numbers, flow
+                placed = [*deployed[treatment.name].values()]
+                varied = placed, settings.uncertainty, numbers, flow, settings.straightening
                 keys[f"vary {treatment.name}"] = key_of("vstent.plan.uncertainty", *varied, without=unused)
     return keys
 

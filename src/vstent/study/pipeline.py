@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from vstent.anatomy.morphology import morphology
+from vstent.deployment.straightening import Straightening
 from vstent.devices.treatment import BARE
 from vstent.flow.case import FlowField
 from vstent.flow.convergence import Sensitivity, convergence
 from vstent.flow.problem import flow_case
 from vstent.flow.settings import FlowSettings
 from vstent.flow.simulation import check_engine
-from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io import writers
 from vstent.study import outputs, stages
@@ -36,7 +36,17 @@ from vstent.study.folder import (
     implant_folder,
     straightened_folder,
 )
-from vstent.study.keys import ANATOMY, VESSEL, anatomy_keys, hash_of, key_of, measures_key, stage_name, study_keys
+from vstent.study.keys import (
+    ANATOMY,
+    STRAIGHTENED,
+    VESSEL,
+    anatomy_keys,
+    hash_of,
+    key_of,
+    measures_key,
+    stage_name,
+    study_keys,
+)
 from vstent.study.progress import OnProgress, Progress
 from vstent.study.repeat import SECONDS, former_source, is_of_another, merged, note_begun, provenance, refuse_other
 from vstent.study.settings import Settings
@@ -55,8 +65,10 @@ class Computed:
     """Flows by treatment, ``bare`` first; empty where no flow was requested."""
     whole: Vessel | None
     """The vessel before it was trimmed; None where it is not stored."""
-    straightened: Mapping[str, Surface]
-    """Lumens that have yielded to treatments, by their names."""
+    yielded: Mapping[str, Straightening]
+    """Arteries that have yielded to treatments, with the devices in them, by the name of the treatment."""
+    shown: Mapping[str, FlowField]
+    """Flows to draw by treatment: as `fields`, and in an artery that has yielded the one with its devices."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,8 +158,8 @@ def run(
         fields = {name: field for name, field in flows.items() if "/" not in name}
         failures |= unflown
         varied = stages.vary_all(anatomy, implants, settings, store, keys)
-        lumens = {name: one.anatomy.vessel.lumen for name, one in yielded.items()}
-        computed = Computed(anatomy, implants, fields, store.load(VESSEL, keys[VESSEL], Vessel), lumens)
+        shown = {name: flows.get(f"{name}{STRAIGHTENED}", field) for name, field in fields.items()}
+        computed = Computed(anatomy, implants, fields, store.load(VESSEL, keys[VESSEL], Vessel), yielded, shown)
 
         def measures() -> dict[str, Any]:
             progress(Progress("measure", 0.0, computed=computed))

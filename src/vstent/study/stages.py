@@ -31,10 +31,10 @@ from vstent.devices.stent import Coils, Deployment, Landing, Stent
 from vstent.devices.treatment import BARE, Implant, Treatment
 from vstent.errors import FlowError, InputError, LandingError, ReadError, VesselError, VstentError
 from vstent.flow.background import BackgroundWork
-from vstent.flow.case import FlowField
+from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.ends import ASSUMED
 from vstent.flow.engines import Progress as FlowProgress
-from vstent.flow.grade import computation_of, grade
+from vstent.flow.grade import NOT_USABLE, computation_of, grade
 from vstent.flow.indices import balance, between_coils, indices, ratios
 from vstent.flow.ostium import sac_surfaces
 from vstent.flow.problem import flow_case, vessel_case
@@ -46,7 +46,7 @@ from vstent.io.images import read_image
 from vstent.kernels.arrays import Floats
 from vstent.plan.bands import bands
 from vstent.plan.treatments import rank_treatments
-from vstent.plan.uncertainty import Uncertainty, vary, vary_seeds
+from vstent.plan.uncertainty import EFFECTS, Uncertainty, vary, vary_seeds
 from vstent.study.folder import flow_folder
 from vstent.study.keys import ALONE, ANATOMY, STRAIGHTENED, VESSEL, flow_stage, is_varied, stage_name, yields
 from vstent.study.outputs import write_field
@@ -426,8 +426,10 @@ def vary_all(
                 if isinstance(deployment.stent, Coils):
                     varied = vary_seeds(anatomy, deployment.stent, settings.uncertainty, **how)
                 else:
-                    way = on_path(anatomy, deployment.stent.path)
-                    varied = vary(way, deployment, settings.uncertainty, [one.stent for one in coils], **how)
+                    way, kept = on_path(anatomy, deployment.stent.path), [one.stent for one in coils]
+                    varied = vary(
+                        way, deployment, settings.uncertainty, kept, straightening=settings.straightening, **how
+                    )
                 tell(f"{len(varied.points)} deployments; {varied.n_failed} of them did not fit.")
             store.save(stage, keys[stage], varied)
         spreads[treatment.name] = varied.metrics()
@@ -452,7 +454,6 @@ def measure_study(
         case = flow_case(anatomy, (), settings.flow)
     for name, field in fields.items():
         flow = between_coils(indices(field, *shapes), _porosity(implants.get(name, {}), settings.flow))
-        judged = grade(case, field, flow)
         left = {"unsettled_fraction": field.unsettled_fraction} if isfinite(field.unsettled_fraction) else {}
         of_flow = case if name == BARE else case.resisted_as(fields[BARE])
         treatments[name]["flow"] = flow | left | balance(of_flow, field)
@@ -460,8 +461,7 @@ def measure_study(
             bare = flow
         else:
             treatments[name]["change"] = ratios(bare, flow)
-        quality = {"grade": judged.level, "reasons": list(judged.reasons)} | judged.measures
-        treatments[name]["quality"] = quality | computation_of(of_flow, field)
+        treatments[name]["quality"] = _quality(case, field, flow) | computation_of(of_flow, field)
     for treatment in settings.treatments:
         for implant in treatment.implants if treatment.name in implants else ():
             measures, deployment = (
@@ -499,9 +499,18 @@ def measure_straightened(
         for end, deployed in ((ALONE, {}), (STRAIGHTENED, implants)):
             if (field := fields.get(f"{name}{end}")) is not None:
                 flow = between_coils(indices(field, *sac_surfaces(artery.anatomy)), _porosity(deployed, settings))
-                part = {"flow": flow, "change": ratios(indices(fields[BARE], *sac_surfaces(anatomy)), flow)}
+                case = flow_case(artery.anatomy, (), settings)
+                quality = _quality(case, field, flow) | computation_of(case.resisted_as(fields[BARE]), field)
+                change = ratios(indices(fields[BARE], *sac_surfaces(anatomy)), flow)
+                part = {"flow": flow, "change": change, "quality": quality}
                 found[name] |= {"bare": part} if end == ALONE else part
     return found
+
+
+def _quality(case: FlowCase, field: FlowField, flow: Mapping[str, float]) -> dict[str, Any]:
+    """Return the grade of a flow with its reasons and measures."""
+    judged = grade(case, field, flow)
+    return {"grade": judged.level, "reasons": list(judged.reasons)} | judged.measures
 
 
 def straightening_notes(metrics: Mapping[str, Any]) -> tuple[str, ...]:
@@ -509,10 +518,20 @@ def straightening_notes(metrics: Mapping[str, Any]) -> tuple[str, ...]:
     notes, key = [], "mean_sac_velocity_m_s_ratio"
     for name, treatment in metrics["treatments"].items():
         if found := treatment.get("straightening"):
-            note = f"Straightening, {name}: {described(found)}"
+            varied = treatment.get("uncertainty", {}).get("intervals", {})
+            note = f"Straightening, {name}: {described(found, varied)}"
             changes = [part.get("change", {}).get(key) for part in (treatment, found.get("bare", {}), found)]
             if all(changes):
-                alone, straight, both = (f"{one - 1:+.0%}" for one in changes)
+                bands = [varied.get(f"{effect}{key}") for effect in ("", *EFFECTS)]
+                pairs = [*zip(changes, bands, strict=True)]
+                is_wide = any(band and band["high"] - band["low"] > abs(one - 1) for one, band in pairs)
+                alone, straight, both = (
+                    f"{one - 1:+.0%}" + (f" ({band['low'] - 1:+.0%} to {band['high'] - 1:+.0%})" if band else "")
+                    for one, band in pairs
+                )
+                poor = NOT_USABLE in (part.get("quality", {}).get("grade") for part in (found.get("bare", {}), found))
+                note += " A band of the velocity is wider than its effect." if is_wide else ""
+                note += " The flow in the straightened artery is not usable: use a finer grid." if poor else ""
                 note += f" Mean sac velocity: {alone} by the devices, {straight} by straightening, {both} by both."
             notes.append(note)
     return tuple(notes)

@@ -111,7 +111,7 @@ def test_a_band_is_done_when_all_that_it_needs_is(threads):
     domain, refill = with_septa(state.domain, rng), state.refill
     limit = thickest(case, domain)
     grid = Grid(domain, limit, address(domain, limit))
-    a, links = grid.addressing, build_links(case, grid, state.scales, None)
+    a, links = grid.addressing, build_links(case, grid, state.scales)
     links.source[:] = 0.01 * rng.normal(size=links.source.size)
     all_bands = grid.bands
     assert len(all_bands) > 20

@@ -81,8 +81,8 @@ def settled(live: LiveFlow) -> tuple[float, float]:
 @cache
 def alone(live: LiveFlow, one: tuple[Sheet, ...]) -> tuple[float, float]:
     """Return neck inflow and sac velocity of a run of its own, in the same coarse flow."""
-    engine = LatticeBoltzmann(live.cell_size_mm, None, live.outer)
-    fine = replace(case(), media=one, numerics=replace(SETTINGS.numerics, tolerance=1e-3))
+    engine = LatticeBoltzmann(live.cell_size_mm)
+    fine = replace(case(), media=one, numerics=replace(SETTINGS.numerics, close_up=True, tolerance=1e-3))
     found = indices(run(engine, fine, start=live.outer), fine.sac, fine.ostium)
     return found["neck_inflow_mL_s"], found["mean_sac_velocity_m_s"]
 

@@ -8,31 +8,43 @@ import numpy as np
 
 from vstent.flow.case import FlowCase
 from vstent.flow.engines import Saved
-from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.scales import Scales
 from vstent.flow.lattice.state import Snapshot, State
 from vstent.flow.lattice.stepping import build, take_pace
 
 
 def pack(state: State) -> Saved:
-    """Return the arrays of a run that cannot be rebuilt from its case and grid."""
-    if state.device is not None:
-        state.device.fetch(state)
-    return {
+    """Return the arrays of a run that cannot be rebuilt from its case and grids."""
+    for level in state.levels:
+        if level.device is not None:
+            level.device.fetch(level)
+    saved = {
         "check_s": np.array(state.check_s),
         "pace": state.pace,
         "kept": np.array(state.snapshots.maxlen or 0),
         "steps": np.array(state.steps),
         "since_check": np.array(state.since_check),
         "loop_seconds": np.array(state.loop_seconds),
-        "populations": state.populations[: 19 * state.addressing.stride],
-        "source": state.links.source,
-        "openings": state.links.openings,
-        "course": state.built[0].course,
-        "refill": state.refill.refill,
         "history": np.array(state.history),
-        **_columns("last", state.snapshots, len(state.domain.cells)),
-        **_columns("means", state.blocks, len(state.domain.cells)),
+    }
+    for number, level in enumerate(state.levels):
+        saved |= {f"{number} {name}": values for name, values in _of_level(level).items()}
+    return saved
+
+
+def _of_level(level: State) -> Saved:
+    """Return the arrays of one level."""
+    between = level.interface
+    return {
+        "populations": level.populations[: 19 * level.addressing.stride],
+        "source": level.links.source,
+        "openings": level.links.openings,
+        "course": level.built[0].course,
+        "refill": level.refill.refill,
+        "lack": np.zeros(0) if between is None else between.lack,
+        "push": np.zeros(0) if between is None else between.push,
+        **_columns("last", level.snapshots, len(level.domain.cells)),
+        **_columns("means", level.blocks, len(level.domain.cells)),
     }
 
 
@@ -58,19 +70,24 @@ def _snapshots(name: str, saved: Saved, scales: Scales) -> Iterator[Snapshot]:
         yield Snapshot(replace(scales, step_s=float(step_s)), velocity, density, outflow, int(checks), speed)
 
 
-def unpack(case: FlowCase, cell_size_mm: float, saved: Saved, close_up: CloseUp | None) -> State:
+def unpack(case: FlowCase, cell_size_mm: float, saved: Saved) -> State:
     """Rebuild a run from its case and the arrays of `pack`."""
     check_s, kept = float(saved["check_s"]), int(saved["kept"])
-    state = build(case, cell_size_mm, check_s, saved["pace"], close_up=close_up, start=None, kept=kept)
-    state.history = list(saved["history"])
-    state.built[0].course[:] = saved["course"]
+    state = build(case, cell_size_mm, check_s, saved["pace"], start=None, kept=kept)
+    state.history[:] = list(saved["history"])
+    for number, level in enumerate(state.levels):
+        level.built[0].course[:] = saved[f"{number} course"]
     take_pace(state)
-    state.populations[: 19 * state.addressing.stride] = saved["populations"]
-    state.links.source[:] = saved["source"]
-    state.links.openings[:] = saved["openings"]
-    state.refill.refill[:] = saved["refill"]
-    state.snapshots = deque(_snapshots("last", saved, state.scales), maxlen=kept)
-    state.blocks = tuple(_snapshots("means", saved, state.scales))
+    for number, level in enumerate(state.levels):
+        level.populations[: 19 * level.addressing.stride] = saved[f"{number} populations"]
+        level.links.source[:] = saved[f"{number} source"]
+        level.links.openings[:] = saved[f"{number} openings"]
+        level.refill.refill[:] = saved[f"{number} refill"]
+        if level.interface is not None:
+            level.interface.lack[:] = saved[f"{number} lack"]
+            level.interface.push[:] = saved[f"{number} push"]
+        level.snapshots = deque(_snapshots(f"{number} last", saved, level.scales), maxlen=kept)
+        level.blocks = tuple(_snapshots(f"{number} means", saved, level.scales))
     state.steps, state.since_check = int(saved["steps"]), int(saved["since_check"])
     state.loop_seconds = float(saved["loop_seconds"])
     return state

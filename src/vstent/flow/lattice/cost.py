@@ -11,21 +11,18 @@ import numpy as np
 from vstent.errors import FlowError
 from vstent.flow.case import PHASES, FlowCase
 from vstent.flow.domain import default_cell_size_mm, extended_volume_mm3
-from vstent.flow.lattice import close_up
 from vstent.flow.lattice.gpu import free_gpu_bytes
 from vstent.flow.lattice.kernels import d3q19, lanes
 from vstent.flow.lattice.kernels.warm import keep_flow
+from vstent.flow.lattice.levels import SHARES, WIDTH, count, volume_mm3
 from vstent.flow.lattice.pace import pace
 from vstent.flow.memory import free_memory_bytes
 
 BYTES_PER_CELL = 750
 """Peak memory per cell of blood, in bytes. Measured on 0.3 to 0.8 million cells: 300 for the time steps, 280 for the
 last checks and the block means; the rest is for other flows of the same study."""
-BYTES_PER_CELL_OF_RESULT = 130
-"""Memory in bytes per cell outside a refined region, whose values are interpolated from the coarser grid (measured on
-0.5 million cells)."""
 BYTES_PER_PHASE_AND_CELL = 32
-"""Memory in bytes per stored phase of a cycle and cell, computed or interpolated."""
+"""Memory in bytes per stored phase of a cycle and cell."""
 BYTES_PER_GRID_POINT = 6
 """Memory in bytes per grid point of the box around the vessel (measured: 3)."""
 MOST_CELLS = 1e8
@@ -55,11 +52,11 @@ class Cost:
     cell_size_mm: float
     """Grid spacing."""
     cells: int
-    """Number of cells of blood computed, extensions of the openings included."""
+    """Number of cells of blood computed on all levels, extensions of the openings included."""
     memory_bytes: int
     """Peak memory."""
     steps: int
-    """Maximum number of time steps."""
+    """Maximum number of time steps on the finest level."""
     seconds: float
     """Maximum run time at the measured speed."""
 
@@ -76,13 +73,17 @@ def estimate(case: FlowCase) -> Cost:
     """Estimate the cost of a flow from the vessel's volume and the speed measured on this machine."""
     cell_size_mm = default_cell_size_mm(case)
     cells, memory_bytes = _size(case, cell_size_mm)
-    steps = _steps(case, cell_size_mm, close_up.SHARE_WITHIN if case.numerics.close_up else 1)
-    updates = cells * steps
-    if case.numerics.close_up:
-        wide_cells = abs(case.vessel.closed.volume_mm3) / (close_up.WIDTH * cell_size_mm) ** 3
-        updates += wide_cells * _steps(case, cell_size_mm, close_up.SHARE_AROUND)
+    steps = _steps(case, cell_size_mm)
+    updates = sum(of_level * steps / WIDTH**depth for depth, of_level in enumerate(_cells(case, cell_size_mm)))
     seconds = updates / block_rate(on_gpu=case.numerics.device_gpu) * WHOLE_OVER_BLOCK
     return Cost(cell_size_mm, round(cells), round(memory_bytes), steps, seconds)
+
+
+def _cells(case: FlowCase, cell_size_mm: float) -> list[float]:
+    """Return the number of cells of every level, from the finest on."""
+    whole = extended_volume_mm3(case.vessel)
+    volumes_mm3 = [whole] if count(case) == 1 else [volume_mm3(case, WIDTH * cell_size_mm), whole]
+    return [volume / (WIDTH**depth * cell_size_mm) ** 3 for depth, volume in enumerate(volumes_mm3)]
 
 
 def refuse_too_large(case: FlowCase, free_bytes: float | None = None, gpu_bytes: float | None = None) -> None:
@@ -131,26 +132,20 @@ def memory_bytes(case: FlowCase) -> float:
 
 def _size(case: FlowCase, cell_size_mm: float) -> tuple[float, float]:
     """Return the number of cells computed and the peak memory in bytes."""
-    vessel = case.vessel
-    volume_mm3 = extended_volume_mm3(vessel)
+    vessel, cells = case.vessel, sum(_cells(case, cell_size_mm))
     widest = max(opening.diameter_mm for opening in vessel.openings)
     box_mm3 = float(np.prod(np.ptp(vessel.lumen.vertices_mm, axis=0) + 2 * widest))
     phases = 0 if case.waveform is None else PHASES
-    whole = volume_mm3 / cell_size_mm**3
-    of_all = (
-        BYTES_AT_LEAST + box_mm3 / cell_size_mm**3 * BYTES_PER_GRID_POINT + whole * phases * BYTES_PER_PHASE_AND_CELL
-    )
-    if not case.numerics.close_up:
-        return whole, of_all + whole * BYTES_PER_CELL
-    cells = close_up.volume_mm3(case) / cell_size_mm**3
-    return cells, of_all + cells * BYTES_PER_CELL + (whole - cells) * BYTES_PER_CELL_OF_RESULT
+    of_cell = BYTES_PER_CELL + phases * BYTES_PER_PHASE_AND_CELL
+    return cells, BYTES_AT_LEAST + box_mm3 / cell_size_mm**3 * BYTES_PER_GRID_POINT + cells * of_cell
 
 
-def _steps(case: FlowCase, cell_size_mm: float, share: float) -> int:
-    """Return the maximum number of time steps; a steady flow makes the given share of those allowed."""
+def _steps(case: FlowCase, cell_size_mm: float) -> int:
+    """Return the maximum number of time steps on the finest level."""
     if case.waveform is None:
-        return int(share * case.numerics.max_steps)
-    return int(pace(case, cell_size_mm, None).sum()) * case.numerics.max_cycles
+        return int(SHARES[count(case) > 1] * case.numerics.max_steps)
+    finer = WIDTH ** (count(case) - 1)
+    return finer * int(pace(case, finer * cell_size_mm, None).sum()) * case.numerics.max_cycles
 
 
 @cache

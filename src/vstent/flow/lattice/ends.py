@@ -1,7 +1,4 @@
-"""Boundary conditions of the embedded engine at the openings and at the cuts that bound a refined region.
-
-A *cut* is a cross-section of the vessel where the refined region ends and takes its flow from the coarser grid.
-"""
+"""Boundary conditions of the embedded engine at the openings of the vessel."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,11 +6,9 @@ from typing import assert_never
 
 import numpy as np
 
-from vstent.flow import sampling
-from vstent.flow.case import PHASES, FlowCase, Phase
+from vstent.flow.case import PHASES, FlowCase
 from vstent.flow.domain import Domain
 from vstent.flow.ends import FlowRate, Inflow, Pressure, Resistance
-from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.scales import Scales
 from vstent.kernels import directions
@@ -22,9 +17,6 @@ from vstent.kernels.arrays import Floats, Ints
 SOUND_MEMORY = 0.002
 """Rate per pair of time steps at which an inlet updates its mean pressure in steady flow. In pulsatile flow the rate is
 1: the mean follows every pressure change, so that the imposed waveform is kept exactly."""
-STILL = 0.05
-"""Fraction of the mean inflow below which a cut imposes the velocity profile of the mean flow. The instantaneous
-profile is ill-defined when the flow is that small."""
 
 FINER = 8
 """Number of moments per phase of a cycle at which a pulsating profile is evaluated; between them it is linear."""
@@ -32,7 +24,7 @@ FINER = 8
 
 @dataclass(frozen=True, eq=False)
 class Ends:
-    """Boundary conditions at the ends of a grid: openings and cuts."""
+    """Boundary conditions at the openings that a grid has."""
 
     case: FlowCase
     """The flow case."""
@@ -40,21 +32,14 @@ class Ends:
     """The grid."""
     scales: Scales
     """Lattice units."""
-    close_up: CloseUp | None
-    """Refined region and the flow around it; None: the grid covers the whole vessel."""
 
     def imposed(self, patches: Ints, links: Sequence[Ints]) -> tuple[Floats, Floats, Floats, Floats]:
         """Return rows (k, `d3q19.OPENING`) of the ends, and `Links.wanted`, `course` and `shape`."""
-        usual, shape = self._at(self.close_up, patches, links)
-        wanted = usual[:, d3q19.WANTED].copy()
-        phases = () if self.close_up is None else self.close_up.outer.phases
-        time_s = self._moments_s(phases)
+        ends = [self._opening(int(patch) - 1, of_end) for patch, of_end in zip(patches, links, strict=True)]
+        usual = np.array([row for row, _ in ends]).reshape(-1, d3q19.OPENING)
+        shape = np.concatenate([np.zeros((0, 2)), *(shape for _, shape in ends)])
+        wanted, time_s = usual[:, d3q19.WANTED].copy(), self._moments_s()
         course, shapes = np.zeros((len(time_s), len(patches))), np.repeat(shape[None], len(time_s), axis=0)
-        if phases:
-            moments = [self._at(self._outside.at_phase(phase), patches, links) for phase in phases]
-            course += np.stack([rows[:, d3q19.WANTED] for rows, _ in moments])
-            course -= self.case.inflow_factor(time_s)[:, None] * wanted
-            shapes = np.stack([shape for _, shape in moments])
         first = np.cumsum([0, *map(len, links)])
         for row, patch in enumerate(patches):
             if self._is_pulsating(int(patch)):  # the course of the flow rate is in the profile
@@ -62,10 +47,8 @@ class Ends:
                 shapes[:, first[row] : first[row + 1]] = self._pulsating(int(patch) - 1, links[row], time_s)
         return usual, wanted, course, shapes
 
-    def _moments_s(self, phases: Sequence[Phase]) -> Floats:
+    def _moments_s(self) -> Floats:
         """Return the times (m,) in a cycle of the rows of `Links.course`, equally spaced from the first check."""
-        if phases:
-            return np.array([phase.time_s for phase in phases])
         finer = 0
         if self.case.waveform is not None:
             is_pulsating = any(map(self._is_pulsating, range(1, 1 + len(self.case.vessel.inlets))))
@@ -77,26 +60,13 @@ class Ends:
 
     def _is_pulsating(self, patch: int) -> bool:
         """Return whether the velocity profile at an end changes its shape over a cycle."""
-        end = self.case.ends[patch - 1] if patch <= len(self.case.ends) else None
+        end = self.case.ends[patch - 1]
         return isinstance(end, Inflow) and end.is_pulsating and self.case.waveform is not None
 
-    def _at(self, now: CloseUp | None, patches: Ints, links: Sequence[Ints]) -> tuple[Floats, Floats]:
-        """Return rows for `d3q19.drive` and profile coefficients (l, 2) of all links at one moment."""
-        ends = [self._end(now, int(patch), of_end) for patch, of_end in zip(patches, links, strict=True)]
-        return np.stack([row for row, _ in ends]), np.concatenate([shape for _, shape in ends])
-
-    def _end(self, now: CloseUp | None, patch: int, links: Ints) -> tuple[Floats, Floats]:
-        """Return the row and profile coefficients (l, 2) of one end, which is an opening or a cut."""
-        part = patch - 1 - len(self.case.vessel.openings)
-        if now is None or part < 0:
-            return self._opening(now, patch - 1, links)
-        return self._entry(now, part, links) if self._outside.inflow_mL_s[part] > 0 else self._exit(now, part, links)
-
-    def _opening(self, now: CloseUp | None, k: int, links: Ints) -> tuple[Floats, Floats]:
+    def _opening(self, k: int, links: Ints) -> tuple[Floats, Floats]:
         """Return the row and profile coefficients (l, 2) of opening `k`.
 
-        Of several resistances the widest outlet has zero pressure and takes the rest. In a refined region the flow
-        through the others is that of the surrounding flow.
+        Of several resistances the widest outlet has zero pressure and takes the rest.
         """
         opening, end = self.case.vessel.openings[k], self.case.ends[k]
         area = opening.area_mm2 / self.domain.cell_size_mm**2
@@ -108,8 +78,6 @@ class Ends:
                 kind, mean_mL_s = d3q19.OUTFLOW, end.mean_mL_s
             case Resistance() if k > len(self.case.vessel.inlets):
                 kind, mean_mL_s = d3q19.OUTFLOW, end.mean_mL_s
-                if now is not None:
-                    mean_mL_s = float(now.outer.outlets_mL_s[k - len(self.case.vessel.inlets)])
             case Pressure() | Resistance():
                 kind, mean_mL_s = d3q19.PRESSURE, 0.0
                 shape[:, 0] = end.pressure_Pa / self.scales.pressure_Pa if isinstance(end, Pressure) else 0.0
@@ -153,62 +121,12 @@ class Ends:
         """Return the near ends, middles and far ends (3 l, 3) of links."""
         return np.concatenate([self._along(links, part)[2] for part in (0.0, 0.5, 1.0)])
 
-    def _entry(self, now: CloseUp, part: int, links: Ints) -> tuple[Floats, Floats]:
-        """Return the row and profile coefficients of a cut with inflow.
-
-        The velocity profile is that of the surrounding flow, scaled to the flow rate through this cut.
-        """
-        normal, area = self._section(links)
-        shown = now if now.inflow_mL_s[part] > STILL * self._outside.inflow_mL_s[part] else self._outside
-        mean = shown.inflow_mL_s[part] / self.scales.flow_mL_s / area
-        profile = (self._velocity(shown, links, way) / mean for way in (0.0, 0.5, 1.0))
-        speed = now.inflow_mL_s[part] / self.scales.flow_mL_s / area
-        row = self._row(d3q19.INFLOW, speed, normal, area)
-        return row, self._sent(links, normal, area, *profile)
-
-    def _exit(self, now: CloseUp, part: int, links: Ints) -> tuple[Floats, Floats]:
-        """Return the row and profile coefficients of a cut with outflow.
-
-        The density follows the pressure of the surrounding flow. A uniform offset adjusts it so that the flow rate
-        through the cut is that of the surrounding flow. The cut with the largest outflow keeps its pressure and takes
-        the remaining flow.
-        """
-        normal, area = self._section(links)
-        density = sampling.values_at(now.outer, self._along(links, 0.5)[2])[1] / self.scales.pressure_Pa
-        inward = np.maximum(0.0, -self._velocity(now, links, 0.5) @ normal)
-        density += 1.5 * inward**2  # `d3q19.outlet_source` subtracts this term again
-        outside, first = self._outside, len(self.case.vessel.inlets) + 1
-        within = [k for k in range(len(self.case.vessel.outlets)) if (self.domain.link_patch == first + k).any()]
-        most_mL_s = float(np.concatenate([-outside.inflow_mL_s, outside.outer.outlets_mL_s[within]]).max())
-        takes_the_rest = -outside.inflow_mL_s[part] >= most_mL_s * (1 - 1e-9)
-        speed = 0.0 if takes_the_rest else -now.inflow_mL_s[part] / self.scales.flow_mL_s / area
-        row = self._row(d3q19.PRESSURE if takes_the_rest else d3q19.OUTFLOW, speed, normal, area)
-        return row, np.stack([density, np.zeros(len(links))], axis=1)
-
-    @property
-    def _outside(self) -> CloseUp:
-        """Return the refined region and its surrounding flow, where there is one."""
-        assert self.close_up is not None
-        return self.close_up
-
     def _along(self, links: Ints, part: float = 0.0) -> tuple[Ints, Ints, Floats]:
         """Return direction (l,) and velocity (l, 3) of links, and the point (l, 3), mm, at fraction `part` of each."""
         q = self.domain.link_direction[links]
         c = directions.VELOCITIES[q]
         cell = self.domain.cells[self.domain.link_cell[links]]
         return q, c, self.domain.origin_mm + (cell + part * c) * self.domain.cell_size_mm
-
-    def _velocity(self, now: CloseUp, links: Ints, part: float) -> Floats:
-        """Return the velocity (l, 3) of the surrounding flow at fraction `part` of each link, in lattice units."""
-        at_mm = self._along(links, part)[2]
-        return now.velocity_m_s(at_mm, self.domain.surface) / self.scales.speed_m_s
-
-    def _section(self, links: Ints) -> tuple[Floats, float]:
-        """Return the outward normal (3,) of a cut and its area in cell faces."""
-        q, c, _ = self._along(links)
-        faces = c[q <= d3q19.AXIAL].sum(axis=0)
-        area = float(np.linalg.norm(faces))
-        return faces / area, area
 
     def _sent(
         self,

@@ -7,15 +7,14 @@ import numpy as np
 
 from vstent.flow.case import PHASES, FlowCase, FlowField, Phase
 from vstent.flow.engines import AbstractEngine, Outcome, Saved
-from vstent.flow.lattice import close_up as close_ups
 from vstent.flow.lattice import stepping
 from vstent.flow.lattice.checkpoint import pack, unpack
-from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.cost import estimate, memory_bytes, refuse_too_large
 from vstent.flow.lattice.gpu import require_gpu
 from vstent.flow.lattice.kernels import d3q19
+from vstent.flow.lattice.levels import SHARES, WIDTH, count
 from vstent.flow.lattice.pace import longest_step_s, pace, peak_speed_m_s
-from vstent.flow.lattice.reading import field_of, read, read_moving
+from vstent.flow.lattice.reading import field_of, joined, read, read_moving
 from vstent.flow.lattice.settling import CHECKS_APART, SHARE_OF_FIELD, Mean, field_left, mean_of, with_check
 from vstent.flow.lattice.setup import CELL_REYNOLDS, CELL_REYNOLDS_AT_END
 from vstent.flow.lattice.state import Snapshot, State
@@ -27,7 +26,6 @@ CHECK_DIAMETERS = 0.5
 """Flow time between checks, in units of inlet diameter divided by mean inlet speed."""
 LEAST_CHECKS = 24
 """Minimum number of checks within the limit of time steps; convergence cannot be judged with fewer."""
-
 INFLOW_WEIGHT: Final = 3
 """Weight of the relative error of the inflow among the convergence criteria. It is larger than 1 because this error is
 measured, whereas the others are estimated."""
@@ -46,7 +44,7 @@ class AbstractLattice(AbstractEngine[State]):
 
     coarsening: ClassVar[float | None] = 2.0
     refined_by: ClassVar[tuple[str, ...]] = ("cell_size_mm", "lattice_speed")
-    closes_up: ClassVar[bool] = True
+    has_levels: ClassVar[bool] = True
     runs_on_gpu: ClassVar[bool] = True
     has_all_ends: ClassVar[bool] = True
 
@@ -68,14 +66,13 @@ class AbstractLattice(AbstractEngine[State]):
         """
         return replace(case, numerics=replace(case.numerics, lattice_speed=SLOWER * case.numerics.lattice_speed))
 
-    def close_up(self, case: FlowCase) -> CloseUp | None:
-        """Return the refined region of a case; None: the grid covers the whole vessel."""
-        return None if self.outer is None else close_ups.close_up(case, self.outer)
+    def coarsest_mm(self, case: FlowCase) -> float:
+        """Return the grid spacing of the coarsest level."""
+        return self.cell_size_mm * WIDTH ** (count(case) - 1)
 
     def prepare(self, case: FlowCase) -> None:
-        """Build the grid of the whole vessel; that of a refined sac depends on the flow around it."""
-        if self.outer is None:
-            stepping.prepare(case, self.cell_size_mm)
+        """Build the grids."""
+        stepping.prepare(case, self.cell_size_mm)
 
     def save(self, state: State) -> Saved:
         """Return the run as arrays."""
@@ -83,7 +80,7 @@ class AbstractLattice(AbstractEngine[State]):
 
     def resume(self, case: FlowCase, saved: Saved) -> State:
         """Rebuild a run from its case and the saved arrays."""
-        return unpack(case, self.cell_size_mm, saved, self.close_up(case))
+        return unpack(case, self.cell_size_mm, saved)
 
     def step(self, state: State) -> State:
         """Advance the run towards its next check."""
@@ -100,23 +97,20 @@ class LatticeBoltzmann(AbstractLattice):
     """The sparse D3Q19 engine with constant inflow."""
 
     def init(self, case: FlowCase, start: FlowField | None) -> State:
-        """Set up a run whose fastest blood moves `lattice_speed` cells a step (times `STRETCH` in a refined region)."""
-        close_up = self.close_up(case)
-        stretch = 1 if close_up is None else close_ups.STRETCH
-        peak_m_s = peak_speed_m_s(case, self.outer or start, close_up)
-        step_s = stretch * longest_step_s(case, self.cell_size_mm, peak_m_s)
+        """Set up a run whose fastest blood moves `lattice_speed` cells a step."""
+        step_s = longest_step_s(case, self.coarsest_mm(case), peak_speed_m_s(case, start))
         check_s = CHECK_DIAMETERS * case.vessel.inlet.diameter_mm * M_PER_MM / float(case.inlet_speeds_m_s[0])
-        steps = 2 * max(1, round(0.5 * min(check_s / step_s, case.numerics.max_steps / LEAST_CHECKS)))
+        most = case.numerics.max_steps / WIDTH ** (count(case) - 1)
+        steps = 2 * max(1, round(0.5 * min(check_s / step_s, most / LEAST_CHECKS)))
         kept = 2 * CHECKS_APART + 1
-        return stepping.build(
-            case, self.cell_size_mm, steps * step_s, np.array([steps]), close_up=close_up, start=start, kept=kept
-        )
+        return stepping.build(case, self.cell_size_mm, steps * step_s, np.array([steps]), start=start, kept=kept)
 
     def step(self, state: State) -> State:
         """Advance the run towards its next check and, at a check, update the block means."""
         super().step(state)
         if not state.since_check:
-            state.blocks = with_check(state.blocks, state.snapshots[-1])
+            for level in state.levels:
+                level.blocks = with_check(level.blocks, level.snapshots[-1])
         return state
 
     def terminate(self, state: State) -> float | None:
@@ -126,23 +120,25 @@ class LatticeBoltzmann(AbstractLattice):
         """
         if state.since_check:
             return None
-        if state.snapshots[-1].is_lost:
+        if any(level.snapshots[-1].is_lost for level in state.levels):
             return float("nan")
         return min(_left(state), _mean(state).left)
 
     def max_checks(self, state: State) -> int:
         """Return the maximum number of checks within the limit of time steps."""
-        steps = state.case.numerics.max_steps * (1 if self.outer is None else close_ups.SHARE_WITHIN)
-        return max(4, int(steps // state.steps_per_check))
+        share = SHARES[state.finer is not None]
+        return max(4, int(share * state.case.numerics.max_steps // state.finest.steps_per_check))
 
     def result(self, state: State, outcome: Outcome) -> FlowField:
         """Return the last check of a converged flow, or the time average of an unsteady one."""
         left = _left(state)
         if left < state.case.numerics.tolerance:
-            return field_of(state, read(state, [state.snapshots[-1]]), outcome, left, "The flow has converged.")
+            flows = [read(level, [level.snapshots[-1]]) for level in state.levels]
+            return field_of(state, flows, outcome, left, "The flow has converged.")
         mean = _mean(state)
         uncertain, advice = _of_mean(state, mean, is_converged=outcome.is_converged)
-        return field_of(state, read_moving(state, state.blocks[-mean.blocks :]), outcome, uncertain, advice)
+        flows = [read_moving(level, level.blocks[-mean.blocks :]) for level in state.levels]
+        return field_of(state, flows, outcome, uncertain, advice)
 
 
 @dataclass(frozen=True)
@@ -151,9 +147,8 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
 
     def init(self, case: FlowCase, start: FlowField | None) -> State:
         """Set up a run whose time steps divide each phase, with a peak speed below `lattice_speed` cells per step."""
-        close_up, phase_s = self.close_up(case), case.pulse.period_s / PHASES
-        steps = pace(case, self.cell_size_mm, self.outer or start, close_up)
-        return stepping.build(case, self.cell_size_mm, phase_s, steps, close_up=close_up, start=start, kept=PHASES)
+        phase_s, steps = case.pulse.period_s / PHASES, pace(case, self.coarsest_mm(case), start)
+        return stepping.build(case, self.cell_size_mm, phase_s, steps, start=start, kept=PHASES)
 
     def terminate(self, state: State) -> float | None:
         """Return the relative difference of the monitored quantities between the last two cycles.
@@ -162,10 +157,10 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
         """
         if state.since_check:
             return None
-        if state.snapshots[-1].is_lost:
+        if any(level.snapshots[-1].is_lost for level in state.levels):
             return float("nan")
         change = cycle_change(np.array(state.history))
-        return max(change, _outflow_error(state)) if state.has_resistances and np.isfinite(change) else change
+        return max(change, _outflow_error(state)) if state.case.resistances and np.isfinite(change) else change
 
     def max_checks(self, state: State) -> int:
         """Return the number of phases in the maximum number of cycles."""
@@ -173,29 +168,32 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
 
     def result(self, state: State, outcome: Outcome) -> FlowField:
         """Return the mean flow of the last cycle, with its phases."""
-        phases = []
-        for k, snapshot in enumerate(state.snapshots):
-            flow = read(state, [snapshot])
-            moment = (flow.velocity_m_s,), (flow.pressure_Pa,), flow.wall_shear_stress_Pa
-            phases.append(Phase((k + 1) * state.check_s, flow.inlets_mL_s, flow.outlets_mL_s, *moment))
+        levels, phases = state.levels, []
+        for k in range(len(state.snapshots)):
+            flows = [read(level, [level.snapshots[k]]) for level in levels]
+            flow = joined(state, flows)
+            moment = tuple(one.velocity_m_s for one in flows), tuple(one.pressure_Pa for one in flows)
+            ends_mL_s = flow.inlets_mL_s, flow.outlets_mL_s
+            phases.append(Phase((k + 1) * state.check_s, *ends_mL_s, *moment, flow.wall_shear_stress_Pa))
         changes = np.array([change for change in outcome.residual if np.isfinite(change)])
         advice = cycles_advice(changes, len(state.history) // PHASES, is_converged=outcome.is_converged)
         # For shear-thinning blood the wall shear stress of the mean flow differs from the mean wall shear stress.
         mean_Pa = np.asarray(np.mean([phase.wall_shear_stress_Pa for phase in phases], axis=0, dtype=np.float64))
-        flow = replace(read(state, list(state.snapshots)), wall_shear_stress_Pa=mean_Pa)
-        return field_of(state, flow, outcome, outcome.residual[-1], advice, tuple(phases))
+        flows = [read(level, list(level.snapshots)) for level in levels]
+        field = field_of(state, flows, outcome, outcome.residual[-1], advice, tuple(phases))
+        return replace(field, wall_shear_stress_Pa=mean_Pa)
 
 
 def _left(state: State) -> float:
     """Return the estimated relative distance of the run from convergence."""
-    fields = [one.velocity[state.probe.cells] for one in state.snapshots]
+    fields = [one.velocity[state.finest.probe.cells] for one in state.finest.snapshots]
     links, enters = state.links, state.links.is_inflow
     wanted = (links.wanted * links.openings[:, d3q19.AREA])[enters]
     # Not zero while sound waves leave through the openings.
     inflow_error = float(np.abs(state.snapshots[-1].outflow[enters] + wanted).sum() / wanted.sum())
     of_field = SHARE_OF_FIELD * field_left(fields)
     left = max(quantities_left(np.array(state.history)), of_field, INFLOW_WEIGHT * inflow_error)
-    return max(left, INFLOW_WEIGHT * _outflow_error(state)) if state.has_resistances else left
+    return max(left, INFLOW_WEIGHT * _outflow_error(state)) if state.case.resistances else left
 
 
 def _outflow_error(state: State) -> float:
@@ -213,7 +211,7 @@ def _outflow_error(state: State) -> float:
 
 def _mean(state: State) -> Mean:
     """Return the best time average of the run so far."""
-    return mean_of(state.blocks, np.array(state.history), state.probe.cells)
+    return mean_of(state.finest.blocks, np.array(state.history), state.finest.probe.cells)
 
 
 def _of_mean(state: State, mean: Mean, *, is_converged: bool) -> tuple[float, str]:
@@ -243,7 +241,8 @@ def _of_mean(state: State, mean: Mean, *, is_converged: bool) -> tuple[float, st
 
 def trouble(state: State) -> str:
     """Return one sentence: when the run diverged, where the flow was fastest, the likely cause and what to do."""
-    good = [one for one in state.snapshots if not one.is_lost]
+    lost = next((level for level in state.levels if level.snapshots and level.snapshots[-1].is_lost), state.finest)
+    good = [one for one in lost.snapshots if not one.is_lost]
     when_ms = 1e3 * state.time_s
     if not good:
         return (
@@ -253,12 +252,12 @@ def trouble(state: State) -> str:
     last = good[-1]
     speed = np.linalg.norm(last.velocity, axis=1)
     fastest = int(speed.argmax())
-    behind = next(k for k, one in enumerate(reversed(state.snapshots)) if one is last)
+    behind = next(k for k, one in enumerate(reversed(lost.snapshots)) if one is last)
     good_ms = when_ms - 1e3 * behind * state.check_s
     return (
         f"the flow diverged between {good_ms:.3g} and {when_ms:.3g} ms; the fastest blood before was "
-        f"{speed[fastest] * last.scales.speed_m_s:.2g} m/s at {place(state.domain.centers_mm[fastest])}: "
-        + _cause(state, last, speed, fastest)
+        f"{speed[fastest] * last.scales.speed_m_s:.2g} m/s at {place(lost.domain.centers_mm[fastest])}: "
+        + _cause(lost, last, speed, fastest)
     )
 
 
@@ -274,10 +273,9 @@ def _cause(state: State, last: Snapshot, speed: Floats, fastest: int) -> str:
         if not opening.is_inlet and -(velocity @ opening.normal).min(initial=0.0) > FAST * speed[fastest]:
             role = opening.role
             return f"blood flows back through {role}: cut the vessel further away, or split the outflow by Murray's law"
-    otherwise = "" if state.close_up is None else ", or switch off the refinement in the sac (--refine-sac)"
     cell_reynolds = speed[fastest] / last.scales.viscosity
     return (
         f"the grid is too coarse (grid Reynolds number {cell_reynolds:.0f}; the viscosity is raised above "
         f"{CELL_REYNOLDS:.0f}, and above {CELL_REYNOLDS_AT_END:.0f} beyond the openings): use a grid spacing "
-        f"of {0.7 * state.domain.cell_size_mm:.2g} mm{otherwise}"
+        f"of {0.7 * state.domain.cell_size_mm:.2g} mm"
     )

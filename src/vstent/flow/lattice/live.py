@@ -1,9 +1,8 @@
 """Live flow: two lattices that never stop, one without a device and one whose screen is exchanged while blood flows.
 
-The sac and a piece of the artery are computed on a fine grid, inside the flow of the whole vessel on a coarse grid
-(`close_up`). The coarse flow is computed once, without a device, until the blood of the vessel has been exchanged: a
-device changes the flow of the artery far less than that of the neck. With resistances at the outlets, the flow out
-of the refined region follows the pressure there. Both lattices then step in turn. Every value is
+The sac and a piece of the artery are computed on a fine grid, inside a coarse grid of the whole vessel (`levels`). Both
+start from the flow on the coarse grid alone, without a device, once the blood of the vessel has been exchanged. Both
+lattices then step in turn. With resistances at the outlets, the flow out follows the pressure there. Every value is
 known at any time with an uncertainty, which falls while the flow develops and its averages grow longer.
 
 The flow without a device can be computed in advance (`LiveFlow.prepare`) and stored (`LiveFlow.stored`). Only the
@@ -11,7 +10,7 @@ flow with the device is then left to compute.
 """
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Final
@@ -24,11 +23,11 @@ from vstent.flow.ends import Resistance, outflows
 from vstent.flow.engines import DivergenceError, Outcome, Saved, stepped
 from vstent.flow.indices import neck_diameter_mm, parent_diameter_mm
 from vstent.flow.lattice.checkpoint import pack
-from vstent.flow.lattice.close_up import WIDTH, require_sac
 from vstent.flow.lattice.engine import LatticeBoltzmann, trouble
 from vstent.flow.lattice.kernels import d3q19
+from vstent.flow.lattice.levels import WIDTH, require_sac
 from vstent.flow.lattice.state import NECK_INFLOW, Snapshot, State
-from vstent.flow.lattice.stepping import FOLLOWED, advance, exchange, monitored, snapshot, twin
+from vstent.flow.lattice.stepping import FOLLOWED, advance, monitored, place_screen, snapshot, twin
 from vstent.flow.stopping import SURE, fraction_left, standard_error
 from vstent.kernels.arrays import Floats
 from vstent.units import M3_PER_ML, M_PER_MM
@@ -43,17 +42,16 @@ KNOWN: Final = 0.01
 """Uncertainty of the flow without a device below which only the flow with the device is continued."""
 LATEST: Final = 8
 """Number of readings that are averaged in a flow that converges."""
-CAUTION: Final = 2.5
-"""Factor on the estimated remaining change: slow modes of the sac make it up to 2.5 times too small (T)."""
+CAUTION: Final = 3.5
+"""Factor on the estimated remaining change: slow modes of sac and artery make it up to three times too small."""
 WINDOWS: Final = 4
 """Number of averaging windows that are compared, each half as long as the one before."""
 LEAST_IN_THIRD: Final = 3
 """Least number of readings in a third of the course, from which its range is used."""
 DRIFT: Final = 0.4
 """Largest shift between the means of the last two thirds, over their range, of a flow that does not drift."""
-RANGES: Final = 2.0
-"""Uncertainty of the mean of a few readings, in ranges. With these numbers no change of the neck inflow or of the sac
-velocity lay outside its band in eight flows (demo, arc, T, C0038; Silk, Enterprise), at no reading."""
+RANGES: Final = 4.5
+"""Uncertainty of the mean of a few readings, in ranges."""
 RECENT: Final = 4
 """Number of last readings of which the surest counts (see `known`). Without it 7 % of the readings after the first with
 a band had none (twelve flows; of two in turn, often one)."""
@@ -85,9 +83,9 @@ class BareFlow:
     """A flow without a device that was computed before; a live flow continues from it."""
 
     outer: FlowField
-    """Flow of the whole vessel on the coarse grid."""
+    """Flow of the whole vessel on the coarse grid, from which it began."""
     saved: Saved
-    """State of the lattice in the refined region (see `checkpoint.pack`)."""
+    """State of the lattice (see `checkpoint.pack`)."""
     readings: Floats
     """(n, 2 + 2 k) values read at equal intervals of time (see `Stepping.readings`)."""
 
@@ -108,23 +106,22 @@ class Stepping:
         """Make the time steps up to the next reading; raise a `DivergenceError` if the flow diverges."""
         advance(self.state, self.reading_steps)
         self.state.since_check = 0
-        now = snapshot(self.state)
-        if now.is_lost:
+        now = [snapshot(level) for level in self.state.levels]
+        if any(one.is_lost for one in now):
             raise DivergenceError(trouble(self.state))
         self.readings.append(self._values(now))
         self._read = None
 
-    def _values(self, now: Snapshot) -> Floats:
+    def _values(self, now: Sequence[Snapshot]) -> Floats:
         """Return the values of a reading."""
-        domain, pressure_Pa = self.state.domain, now.pressure_Pa
+        domain, pressure_Pa = self.state.domain, now[0].pressure_Pa
         at_ends_Pa = [pressure_Pa[domain.link_cell[domain.link_patch == k]].mean() for k in self.state.links.patch]
-        return np.concatenate([monitored(self.state, now)[[NECK_INFLOW, 0]], at_ends_Pa, now.outflow_mL_s])
+        return np.concatenate([monitored(self.state, now)[[NECK_INFLOW, 0]], at_ends_Pa, now[0].outflow_mL_s])
 
     def answer(self, bare: Floats, common_Pa: float) -> None:
         """Let the flow out through every end follow its pressure, with the resistance of a flow without a device.
 
-        `bare` is a reading of that, and `common_Pa` the pressure common to its outlets. What lies between an end and
-        its outlets is part of the resistance.
+        `bare` is a reading of that, and `common_Pa` the pressure common to its outlets. The widest takes the rest.
         """
         links, scales = self.state.links, self.state.scales
         leaves = np.flatnonzero(~links.is_inflow)
@@ -136,6 +133,8 @@ class Stepping:
         now_Pa = self.readings[-1][2:].reshape(2, -1)[0, leaves]
         flow_mL_s = outflows(ends, before_mL_s.sum(keepdims=True), now_Pa[None])[0][0]
         wanted = flow_mL_s / scales.flow_mL_s / links.openings[leaves, d3q19.AREA]
+        is_set = links.openings[leaves, d3q19.KIND] == d3q19.OUTFLOW
+        leaves, wanted = leaves[is_set], wanted[is_set]
         links.course[0, leaves] += FOLLOWED * (wanted - links.wanted[leaves] - links.course[0, leaves])
 
     def forget(self) -> None:
@@ -146,7 +145,7 @@ class Stepping:
     def read(self) -> Reading:
         """Return the averages of neck inflow and sac velocity."""
         if self._read is None:
-            values = np.array(self.readings or [self._values(snapshot(self.state))])
+            values = np.array(self.readings or [self._values([snapshot(level) for level in self.state.levels])])
             (inflow, inflow_error), (velocity, velocity_error) = map(known, values.T[:2])
             errors = {"neck_inflow_mL_s": inflow_error, "sac_velocity_m_s": velocity_error}
             self._read = Reading(inflow, velocity, errors)
@@ -169,26 +168,36 @@ def average(values: Floats) -> tuple[float, float]:
 
     Of a flow that converges the last `LATEST` values count, and `CAUTION` times the change that is still expected. Of
     one that oscillates the window counts whose standard error, times `SURE`, is smallest, or before that the last two
-    thirds and `RANGES` times their range, unless they drift. The smallest of these uncertainties is returned; inf with
-    too few values.
+    thirds and `RANGES` times their range; neither of a flow that drifts. The smallest of these uncertainties is
+    returned; inf with too few values.
     """
     late = float(values[-LATEST:].mean())
     # A change passes through zero where a value turns: the worst estimate of the last third counts.
     agreeing = {round(len(values) * part) for part in (0.7, 0.8, 0.9, 1.0)}
     left = CAUTION * max(fraction_left(values[:n, None]) for n in agreeing)
     lengths = {max(1, len(values) >> halvings) for halvings in range(WINDOWS)}
-    means = ((float(values[-n:].mean()), SURE * standard_error(values[-n:, None])) for n in lengths)
+    means = (_by_means(values[-n:]) for n in lengths)
     return min([(late, left), *means, _by_range(values)], key=lambda one: one[1])
+
+
+def _drifts(values: Floats) -> bool:
+    """Return whether the means of both halves of values (n,) differ by more than `DRIFT` times their range."""
+    before, last = np.array_split(values, 2)
+    return bool(abs(last.mean() - before.mean()) > DRIFT * np.ptp(values)) if len(before) and len(last) else True
+
+
+def _by_means(values: Floats) -> tuple[float, float]:
+    """Return the mean of values (n,) and `SURE` times its standard error, as a fraction; inf where they drift."""
+    return float(values.mean()), float("inf") if _drifts(values) else SURE * standard_error(values[:, None])
 
 
 def _by_range(values: Floats) -> tuple[float, float]:
     """Return the mean of the last two thirds and `RANGES` times their range, as a fraction; inf where they drift."""
-    before, last = np.array_split(values[len(values) // 3 :], 2)
-    both = np.concatenate([before, last])
-    spread, mean = float(np.ptp(both)), float(both.mean())
-    if len(last) < LEAST_IN_THIRD or abs(last.mean() - before.mean()) > DRIFT * spread:
+    both = values[len(values) // 3 :]
+    mean = float(both.mean())
+    if len(both) // 2 < LEAST_IN_THIRD or _drifts(both):
         return mean, float("inf")
-    return mean, RANGES * spread / max(abs(mean), 1e-12)
+    return mean, RANGES * float(np.ptp(both)) / max(abs(mean), 1e-12)
 
 
 class LiveFlow:
@@ -201,11 +210,11 @@ class LiveFlow:
     def __init__(
         self, case: FlowCase, told: Callable[[float], None] | None = None, stored: BareFlow | None = None
     ) -> None:
-        numerics = replace(case.numerics, close_up=False, tolerance=TOLERANCE)
+        numerics = replace(case.numerics, close_up=True, device_gpu=False, tolerance=TOLERANCE)
         self.case = replace(case, waveform=None, numerics=numerics)
         self.cell_size_mm = preview_spacing_mm(self.case)
         self.outer = self._around(told) if stored is None else stored.outer
-        engine = LatticeBoltzmann(self.cell_size_mm, None, self.outer)
+        engine = LatticeBoltzmann(self.cell_size_mm)
         state = engine.init(self.case, self.outer) if stored is None else engine.resume(self.case, stored.saved)
         self._bare = Stepping(state, 2 * max(1, round(0.5 * state.steps_per_check / READINGS_PER_CHECK)))
         self._bare.readings.extend([] if stored is None else stored.readings)
@@ -214,7 +223,8 @@ class LiveFlow:
     def _around(self, told: Callable[[float], None] | None) -> FlowField:
         """Return the flow of the whole vessel on the coarse grid once its blood has been exchanged."""
         # Oscillations at the neck would need most of the steps, and the fine grid computes the neck.
-        case = replace(self.case, target=Target(require_sac(self.case), None))
+        numerics = replace(self.case.numerics, close_up=False)
+        case = replace(self.case, target=Target(require_sac(self.case), None), numerics=numerics)
         engine = LatticeBoltzmann(WIDTH * self.cell_size_mm)
         state, left = engine.init(case, None), None
         exchange_s = extended_volume_mm3(case.vessel) * M_PER_MM**3 / (case.inflow_mL_s * M3_PER_ML)
@@ -234,7 +244,7 @@ class LiveFlow:
             return
         if self._shown is self._bare:
             self._shown = Stepping(twin(self._bare.state), self._bare.reading_steps)
-        exchange(self._shown.state, replace(self.case, media=media))
+        place_screen(self._shown.state, replace(self.case, media=media))
         self._shown.forget()
 
     def advance(self, seconds: float) -> int:
@@ -296,7 +306,8 @@ class LiveFlow:
 
     def field(self) -> FlowField:
         """Return the present flow in the refined region, for streamlines: only its velocity is meaningful."""
-        now, domain, wall = snapshot(self.state), self.state.domain, self.case.vessel.lumen
+        finest, wall = self.state.finest, self.case.vessel.lumen
+        now, domain = snapshot(finest), finest.domain
         n, outer = len(wall.vertices_mm), self.outer
         return replace(
             outer,

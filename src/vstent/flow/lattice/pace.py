@@ -11,7 +11,6 @@ import numpy as np
 
 from vstent.flow.case import PHASES, FlowCase, FlowField
 from vstent.flow.domain import extended_volume_mm3
-from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.kernels import d3q19
 from vstent.kernels.arrays import Floats, Ints
 from vstent.units import M_PER_MM
@@ -33,14 +32,13 @@ MOMENTS: Final = 25
 """Number of moments per phase at which the waveform is evaluated."""
 
 
-def peak_speed_m_s(case: FlowCase, start: FlowField | None, close_up: CloseUp | None = None) -> float:
+def peak_speed_m_s(case: FlowCase, start: FlowField | None) -> float:
     """Estimate the speed that sets the time step: all but a fraction `FEW` of the blood stays below it.
 
     The overall peak speed is at most `HASTE` times as high.
     """
     if start is not None:
-        speed_m_s = start.speed_m_s if close_up is None else start.finest.speed_m_s[close_up.part < 0]
-        return FASTER * float(max(np.quantile(speed_m_s, 1 - FEW), speed_m_s.max() / HASTE))
+        return FASTER * float(max(np.quantile(start.speed_m_s, 1 - FEW), start.speed_m_s.max() / HASTE))
     at_outlets_m_s = 3.0 * case.inflow_mL_s / sum(outlet.area_mm2 for outlet in case.vessel.outlets)
     return float(max(3.0 * case.inlet_speeds_m_s.max(), at_outlets_m_s))
 
@@ -50,7 +48,7 @@ def longest_step_s(case: FlowCase, cell_size_mm: float, peak_m_s: float) -> floa
     return case.numerics.lattice_speed * cell_size_mm * M_PER_MM / peak_m_s
 
 
-def pace(case: FlowCase, cell_size_mm: float, start: FlowField | None, close_up: CloseUp | None = None) -> Ints:
+def pace(case: FlowCase, cell_size_mm: float, start: FlowField | None) -> Ints:
     """Return the number of time steps (PHASES,) in every phase of a pulse; all are even.
 
     The fastest blood of each phase moves at most `lattice_speed` cells per step. A longer time step also lowers the
@@ -61,7 +59,7 @@ def pace(case: FlowCase, cell_size_mm: float, start: FlowField | None, close_up:
     phase_s = waveform.period_s / PHASES
     time_s = phase_s * (np.arange(PHASES)[:, None] + np.linspace(0, 1, MOMENTS))
     factor = np.abs(waveform.factor(time_s))
-    peak_m_s = _peaks_m_s(case, factor, start, close_up)
+    peak_m_s = _peaks_m_s(case, factor, start)
     step_s = np.array([longest_step_s(case, cell_size_mm, peak) for peak in peak_m_s])
     shortest_s = step_s.min()
     way_mm = extended_volume_mm3(case.vessel) / sum(inlet.area_mm2 for inlet in case.vessel.inlets)
@@ -74,7 +72,7 @@ def pace(case: FlowCase, cell_size_mm: float, start: FlowField | None, close_up:
     return (2 * np.ceil(0.5 * phase_s / step_s)).astype(np.int32)
 
 
-def _peaks_m_s(case: FlowCase, factor: Floats, start: FlowField | None, close_up: CloseUp | None) -> Floats:
+def _peaks_m_s(case: FlowCase, factor: Floats, start: FlowField | None) -> Floats:
     """Return the peak speed (PHASES,) in every phase from the factor of the flow rate at moments of it (PHASES, m).
 
     With a whole cycle in `start`, the speed at both ends of each phase is used. Otherwise the peak speed is scaled with
@@ -83,7 +81,7 @@ def _peaks_m_s(case: FlowCase, factor: Floats, start: FlowField | None, close_up
     """
     within, at_end = factor.max(axis=1), factor[:, -1]
     if start is None or len(start.phases) < PHASES:
-        return peak_speed_m_s(case, start, close_up) * np.maximum(within, np.roll(within, 1))
-    ends_m_s = np.array([peak_speed_m_s(case, start.at_phase(phase), close_up) for phase in start.phases])
+        return peak_speed_m_s(case, start) * np.maximum(within, np.roll(within, 1))
+    ends_m_s = np.array([peak_speed_m_s(case, start.at_phase(phase)) for phase in start.phases])
     at_ends = np.maximum(at_end, np.roll(at_end, 1))
     return np.maximum(ends_m_s, np.roll(ends_m_s, 1)) * within / np.maximum(at_ends, 0.5 * within)

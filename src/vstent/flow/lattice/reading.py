@@ -5,13 +5,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from vstent.deployment.struts import thickness_mm
 from vstent.flow import domain as domains
 from vstent.flow.case import FlowField, Level, Phase
 from vstent.flow.ends import outflows
 from vstent.flow.engines import Outcome
-from vstent.flow.lattice import close_up as close_ups
+from vstent.flow.lattice.levels import WIDTH
 from vstent.flow.lattice.setup import CELL_REYNOLDS
 from vstent.flow.lattice.state import NECK_INFLOW, Snapshot, State
 from vstent.flow.wall_stress import mean_shear_Pa, wall_stress
@@ -32,9 +33,9 @@ class Reading:
     wall_pressure_Pa: Floats
     """(v,) pressure at every vertex of the lumen."""
     inlets_mL_s: Floats
-    """(i,) flow rate into every inlet; nan where a refined region does not reach it."""
+    """(i,) flow rate into every inlet; 0 on a level without openings."""
     outlets_mL_s: Floats
-    """(k,) flow rate out of every outlet; nan likewise, 0 where no cell of the grid reaches it."""
+    """(k,) flow rate out of every outlet; 0 likewise, and where no cell of the grid reaches it."""
     mean_speed_m_s: Floats | None = None
     """(n,) time-averaged speed of an unsteady flow; None for a steady one."""
     mean_shear_Pa: Floats | None = None
@@ -44,17 +45,15 @@ class Reading:
 
 
 def read(state: State, snapshots: Sequence[Snapshot]) -> Reading:
-    """Return the mean of snapshots in SI units, with the wall shear stress."""
+    """Return the mean of snapshots of one level in SI units, with the wall shear stress."""
     domain = state.domain
     velocity_m_s = _mean(snapshots, (one.velocity_m_s for one in snapshots))
     pressure_Pa = _mean(snapshots, (one.pressure_Pa for one in snapshots))
     stress_Pa, wall_pressure_Pa = wall_stress(
         domain, velocity_m_s, pressure_Pa, lumen=state.case.vessel.lumen, blood=state.case.blood
     )
-    outflow_mL_s = np.full(len(state.case.vessel.openings), np.nan if state.close_up else 0.0)
-    is_opening = state.links.patch <= len(outflow_mL_s)
-    through = _mean(snapshots, (one.outflow_mL_s for one in snapshots))
-    outflow_mL_s[state.links.patch[is_opening] - 1] = through[is_opening]
+    outflow_mL_s = np.zeros(len(state.case.vessel.openings))
+    outflow_mL_s[state.links.patch - 1] = _mean(snapshots, (one.outflow_mL_s for one in snapshots))
     backwards_mL_s, outlets_mL_s = state.case.vessel.of_inlets_and_outlets(outflow_mL_s)
     return Reading(velocity_m_s, pressure_Pa, stress_Pa, wall_pressure_Pa, -backwards_mL_s, outlets_mL_s)
 
@@ -78,35 +77,49 @@ def _mean(snapshots: Sequence[Snapshot], values: Iterable[Floats | NDArray[np.fl
     return np.asarray(sum(part * value for part, value in zip(share, values, strict=True)))
 
 
+def joined(state: State, flows: Sequence[Reading]) -> Reading:
+    """Return the flow of the coarsest level with the values at the wall of the finest one at every vertex.
+
+    A vertex belongs to a finer level where the cells from which its stress is computed lie inside the border.
+    """
+    wall, result = state.case.vessel.lumen, flows[0]
+    for coarse, fine, flow in zip(state.levels[:-1], state.levels[1:], flows[1:], strict=True):
+        assert coarse.interface is not None
+        grid = fine.domain
+        behind_mm = wall.vertices_mm - grid.cell_size_mm * wall.vertex_normals
+        distance_mm, nearest = cKDTree(grid.centers_mm).query(behind_mm)
+        is_fine = (distance_mm < 2 * grid.cell_size_mm) & coarse.interface.is_trusted[nearest]
+        for name in ("wall_shear_stress_Pa", "wall_pressure_Pa", "mean_shear_Pa"):
+            values = getattr(flow, name)
+            if values is not None:
+                chosen = np.where(is_fine if values.ndim == 1 else is_fine[:, None], values, getattr(result, name))
+                result = replace(result, **{name: chosen})
+    return replace(result, neck_inflow_mL_s=flows[-1].neck_inflow_mL_s)
+
+
 def field_of(
-    state: State, flow: Reading, outcome: Outcome, left: float, advice: str, phases: tuple[Phase, ...] = ()
+    state: State,
+    flows: Sequence[Reading],
+    outcome: Outcome,
+    left: float,
+    advice: str,
+    phases: tuple[Phase, ...] = (),
 ) -> FlowField:
-    """Return the flow field of a run."""
-    domain, vessel = state.domain, state.case.vessel
-    section_Pa = domains.section_pressure_Pa(vessel, domain, flow.pressure_Pa)
+    """Return the flow field of a run from the flow on every level."""
+    vessel, flow, finest = state.case.vessel, joined(state, flows), state.finest
+    section_Pa = domains.section_pressure_Pa(vessel, state.domain, flow.pressure_Pa)
     inlet_Pa, outlet_Pa = vessel.of_inlets_and_outlets(section_Pa)
-    # Where the grid is too coarse: for the vessel, unless this is a refined region, or for the flow.
-    too_coarse = ""
-    if state.close_up is None:
-        too_coarse = domains.too_narrow(state.case, domain.cell_size_mm)
-        too_coarse += domains.unreached(vessel, domain)
-    wires = domains.wires_of(state.case, domain.cell_size_mm)
-    if wires is not None:
-        advice += (
-            f" The wires are walls, {thickness_mm(wires) / domain.cell_size_mm:.2g} cells thick; {domain.closed_gaps} "
-            "cells in gaps narrower than a cell are closed."
-        )
-    is_vessel = np.repeat(state.limit, state.addressing.length) == CELL_REYNOLDS
-    moments_m_s = [phase.velocity_m_s[0] for phase in phases] or [flow.velocity_m_s]
-    speed_m_s = np.max([np.linalg.norm(one, axis=1) for one in moments_m_s], axis=0)
-    too_coarse += domains.too_fast(domain, np.where(is_vessel, speed_m_s, 0.0), state.case.blood, CELL_REYNOLDS)
-    on_gpu = "" if state.device is None else f" Time steps were launched on the GPU {state.device.how}."
+    levels = tuple(
+        Level.of(level.domain, one.velocity_m_s, one.pressure_Pa, one.mean_speed_m_s)
+        for level, one in zip(state.levels, flows, strict=True)
+    )
     common_Pa = 0.0
-    if state.has_resistances:
+    if state.case.resistances:
         ends, inflow_mL_s = state.case.resistances, np.array([state.case.inflow_mL_s])
         common_Pa = float(outflows(ends, inflow_mL_s, np.nan_to_num(outlet_Pa)[None])[1][0])
-    field = FlowField(
-        levels=(Level.of(domain, flow.velocity_m_s, flow.pressure_Pa, flow.mean_speed_m_s),),
+    updates = sum(WIDTH**depth * len(level.domain.cells) for depth, level in enumerate(state.levels))
+    return FlowField(
+        levels=levels,
         wall=vessel.lumen,
         wall_shear_stress_Pa=flow.wall_shear_stress_Pa,
         wall_pressure_Pa=flow.wall_pressure_Pa,
@@ -117,18 +130,43 @@ def field_of(
         blood=state.case.blood,
         is_converged=outcome.is_converged,
         unsettled_fraction=left,
-        advice=advice + on_gpu + too_coarse,
+        advice=advice + _remarks(state, levels, phases),
         residual=np.array(outcome.residual),
-        steps=state.steps,
+        steps=state.steps * WIDTH ** (len(levels) - 1),
         seconds=outcome.seconds,
-        updates_per_s=len(domain.cells) * state.steps / state.loop_seconds,
+        updates_per_s=updates * state.steps / state.loop_seconds,
         phases=phases,
-        wire_force_N=None if wires is None else force_N(state),
+        wire_force_N=None if domains.wires_of(state.case, finest.domain.cell_size_mm) is None else force_N(finest),
         mean_shear_Pa=flow.mean_shear_Pa,
         common_pressure_Pa=common_Pa,
         neck_inflow_mL_s=flow.neck_inflow_mL_s,
     )
-    return field if state.close_up is None else close_ups.assembled(state.close_up, field)
+
+
+def _remarks(state: State, levels: Sequence[Level], phases: Sequence[Phase]) -> str:
+    """Return sentences on wires, levels, GPU, and on where the grid is too coarse for the vessel or for the flow."""
+    case, finest, remarks = state.case, state.finest.domain, ""
+    wires = domains.wires_of(case, finest.cell_size_mm)
+    if wires is not None:
+        remarks += (
+            f" The wires are walls, {thickness_mm(wires) / finest.cell_size_mm:.2g} cells thick; {finest.closed_gaps} "
+            "cells in gaps narrower than a cell are closed."
+        )
+    if len(levels) > 1:
+        sizes = ", ".join(f"{level.cell_size_mm:.3g} mm ({len(level.cells):,} cells)" for level in levels)
+        remarks += f" The grid spacing is {sizes}, from the whole vessel to the finest level."
+    if state.device is not None:
+        remarks += f" Time steps were launched on the GPU {state.device.how}."
+    remarks += domains.too_narrow(case, state.domain.cell_size_mm) + domains.unreached(case.vessel, state.domain)
+    for number, (level, own) in enumerate(zip(state.levels, levels, strict=True)):
+        moments_m_s = [phase.velocity_m_s[number] for phase in phases] or [own.velocity_m_s]
+        speed_m_s = np.max([np.linalg.norm(one, axis=1) for one in moments_m_s], axis=0)
+        counts = np.repeat(level.limit, level.addressing.length) == CELL_REYNOLDS
+        if level.interface is not None and level.finer is not None:
+            covered = own.cells_at(level.finer.domain.centers_mm)
+            counts[covered[covered >= 0]] = False
+        remarks += domains.too_fast(level.domain, np.where(counts, speed_m_s, 0.0), case.blood, CELL_REYNOLDS)
+    return remarks
 
 
 def force_N(state: State) -> Floats:

@@ -6,11 +6,9 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from vstent.flow.case import FlowCase
 from vstent.flow.domain import Domain
-from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.ends import Ends
 from vstent.flow.lattice.kernels import d3q19, lanes
 from vstent.flow.lattice.scales import Scales
@@ -23,13 +21,6 @@ the viscosity is raised. Fast flow becomes unstable there first: runs failed at 
 CELL_REYNOLDS: Final = 75.0
 """Grid Reynolds number in the vessel above which the viscosity is raised. The systole of C0038 diverged with 100 at a
 grid spacing of 0.4 mm and with 150 at 0.2 mm."""
-CUT_CELLS = 6
-"""Depth in cells of the layer at the cuts of a refined region where the limit of the extensions applies."""
-CELL_REYNOLDS_IN_CUT: Final = 5.0
-"""Grid Reynolds number in the cells next to a cut above which the viscosity is raised. Between the cut and the wall lie
-only a few cells, where disturbances would grow (C0038 at systole: tenfold in 60 steps)."""
-CELLS_IN_CUT: Final = 2
-"""Depth in cells of the layer next to a cut where `CELL_REYNOLDS_IN_CUT` applies."""
 PAGE, OFF_PAGE = 1024, 216
 """Number of float32 values in a page of 4096 bytes, and offset of the stride from whole pages. Addresses that are whole
 pages apart share the same few places of a cache; nineteen populations stored so would make a run a quarter slower."""
@@ -66,8 +57,23 @@ class Addressing:
 
 
 @dataclass(frozen=True, eq=False)
+class Crossings:
+    """Links between two cells of blood of which the mass that passes is read (see `levels`)."""
+
+    cell: Ints
+    """(b,) cell on the side into which mass counts as positive."""
+    address: Ints
+    """(b, 2) addresses of the populations that enter it and that leave it, at home."""
+    start: Ints
+    """(g + 1,) first link of every group."""
+    first: int
+    """Address of what passed along the first link in the even step of the last pair; then those of the other links, and
+    those in the odd step."""
+
+
+@dataclass(frozen=True, eq=False)
 class Grid:
-    """A grid and what depends on it alone; all flows of a whole vessel share it."""
+    """A grid and what depends on it alone; flows in the same vessel share it."""
 
     domain: Domain
     """Cells and links."""
@@ -75,6 +81,10 @@ class Grid:
     """(n,) largest grid Reynolds number of every cell (see `thickest`)."""
     addressing: Addressing
     """Memory layout of the populations."""
+    crossings: tuple[Crossings, ...] = ()
+    """Borders with a finer and with a coarser grid."""
+    side: Ints | None = None
+    """(n,) side of these borders on which each cell lies; None without any."""
 
     @cached_property
     def link_order(self) -> Ints:
@@ -91,17 +101,20 @@ class Grid:
         return int((self.domain.link_patch > 0).sum())
 
     @cached_property
-    def by_layer(self) -> Ints:
-        """Links (o,) of the ends, sorted by layer of their cell."""
-        cell = self.domain.link_cell[self.link_order[: self.of_ends]]
-        return np.argsort(cell, kind="stable").astype(np.int32)
+    def by_layer(self) -> tuple[Ints, Ints]:
+        """Links (o,) of the ends and crossings, sorted by layer of their cell, and these cells (o,)."""
+        of_ends = self.domain.link_cell[self.link_order[: self.of_ends]]
+        cell = np.concatenate([of_ends, *(crossing.cell for crossing in self.crossings)])
+        number = np.arange(len(cell))
+        number[self.of_ends :] += len(self.domain.link_cell) - self.of_ends
+        order = np.argsort(cell, kind="stable")
+        return number[order].astype(np.int32), cell[order]
 
     @cached_property
     def bands(self) -> Ints:
         """Bands (b + 1, 5) for `d3q19.update`: the layers of cells across the first axis of the grid."""
-        a = self.addressing
-        of_ends, of_walls = np.split(self.domain.link_cell[self.link_order], [self.of_ends])
-        cells = a.first_cell, np.unique(of_walls), of_walls, of_ends[self.by_layer], a.septum_cell
+        a, of_walls = self.addressing, self.domain.link_cell[self.link_order[self.of_ends :]]
+        cells = a.first_cell, np.unique(of_walls), of_walls, self.by_layer[1], a.septum_cell
         layer = self.domain.cells[:, 0]
         edges = np.arange(layer.min(), layer.max() + 2)
         bands = np.stack([np.searchsorted(layer[ordered], edges) for ordered in cells], axis=1)
@@ -113,7 +126,10 @@ class Grid:
         """`Refill.place` and `Refill.groups`: the groups of wall cells within which the lost mass is redistributed."""
         cell = self.domain.link_cell[self.link_order[self.of_ends :]]
         wall_cell, of_link = np.unique(cell, return_inverse=True)
-        group = np.unique(self.domain.cells[wall_cell] // REFILL_BLOCK, axis=0, return_inverse=True)[1].ravel()
+        block = self.domain.cells[wall_cell] // REFILL_BLOCK
+        if self.side is not None:
+            block = np.column_stack([block, self.side[wall_cell]])
+        group = np.unique(block, axis=0, return_inverse=True)[1].ravel()
         return self.addressing.place[wall_cell], (*_grouped(group[of_link]), *_grouped(group))
 
 
@@ -121,8 +137,11 @@ class Grid:
 class Links:
     """Coefficients of all links that reflect populations: first those of the ends, then those of the wall.
 
-    The ends are the openings and, in a refined region, the cuts where the region ends. `source` and `openings` change
-    in place during a run.
+    `path`, `weight` and `source` have further links at their end: those that write what passes at `Grid.crossings`
+    behind the populations.
+
+    The ends are the openings of the vessel, which only the coarsest level has. `source` and `openings` change in place
+    during a run.
     """
 
     patch: Ints
@@ -144,7 +163,7 @@ class Links:
     start: Ints
     """(k + 1,) first link of every end, and of the wall."""
     by_layer: Ints
-    """(o,) links of the ends, sorted by layer of their cell."""
+    """Links of the ends and of crossings, sorted by layer of their cell."""
     place: Ints
     """(o,) storage place of the cell of every link of the ends."""
     direction: Ints
@@ -201,12 +220,6 @@ def thickest(case: FlowCase, domain: Domain) -> NDArray[np.float32]:
         beside_mm = np.linalg.norm(offset_mm - ahead_mm[:, None] * opening.normal, axis=1)
         beyond |= (ahead_mm > 0) & (ahead_mm < length_mm) & (beside_mm < opening.diameter_mm)
     limit = np.where(beyond, CELL_REYNOLDS_AT_END, CELL_REYNOLDS)
-    cut = np.zeros(domain.cells.max(axis=0) + 2, dtype=bool)
-    cut[tuple(domain.cells[domain.link_cell[domain.link_patch > len(case.vessel.openings)]].T)] = True
-    for cells, most in ((CUT_CELLS, CELL_REYNOLDS_AT_END), (CELLS_IN_CUT, CELL_REYNOLDS_IN_CUT)):
-        if cut.any():
-            near = ndimage.binary_dilation(cut, ndimage.generate_binary_structure(3, 3), cells)
-            limit[near[tuple(domain.cells.T)]] = most
     return limit.astype(np.float32)
 
 
@@ -269,29 +282,35 @@ def address(domain: Domain, limit: NDArray[np.float32], period: tuple[int, int, 
     )
 
 
-def build_links(case: FlowCase, grid: Grid, scales: Scales, close_up: CloseUp | None) -> Links:
+def build_links(case: FlowCase, grid: Grid, scales: Scales) -> Links:
     """Return the links of the wall (interpolated bounce-back) and of the ends (imposed flow or pressure)."""
     domain, addressing, order = grid.domain, grid.addressing, grid.link_order
     patch = domain.link_patch[order]
     patches = np.unique(patch[patch > 0])
     of_ends = patch[: grid.of_ends]
-    start: Ints = np.asarray(np.searchsorted(of_ends, np.r_[patches, patches[-1] + 1]), dtype=np.int32)
+    start: Ints = np.asarray(np.searchsorted(of_ends, np.r_[patches, patch.max(initial=0) + 1]), dtype=np.int32)
     weight, correction, viscous = wall_weights(domain, addressing, order, scales.relaxation_steps, scales.odd_rate)
     correction[: start[-1]], viscous[: start[-1]], weight[: start[-1]] = 0.0, 0.0, (-1.0, 0.0, 0.0)
     opening_links = order[: start[-1]]
-    ends = Ends(case, domain, scales, close_up)
-    openings, wanted, course, shape = ends.imposed(patches, np.split(opening_links, start[1:-1]))
+    ends = Ends(case, domain, scales)
+    openings, wanted, course, shape = ends.imposed(patches, np.split(opening_links, start[1:-1])[: len(patches)])
     weight[: start[-1]][np.repeat(openings[:, d3q19.KIND] == d3q19.INFLOW, np.diff(start))] = (1.0, 0.0, 0.0)
+    path, both = d3q19.paths(addressing.link_address[order], weight)
+    enters, leaves = np.concatenate([np.zeros((0, 2), np.int32), *(one.address for one in grid.crossings)]).T
+    slots = [one.first + np.arange(2 * len(one.cell)).reshape(2, -1) for one in grid.crossings]
+    slot = np.concatenate([np.zeros((2, 0), np.int32), *slots], axis=1)
+    crossing = np.stack([np.stack([leaves, enters, slot[0]], axis=1), np.stack([enters, leaves, slot[1]], axis=1)])
     return Links(
         patches,
         addressing.link_address[order],
-        *d3q19.paths(addressing.link_address[order], weight),
+        np.ascontiguousarray(np.concatenate([path, crossing], axis=1), dtype=np.int32),
+        np.concatenate([both, np.tile(np.array([1.0, -1.0], np.float32), (len(enters), 1))]),
         correction.astype(np.float32),
         viscous.astype(np.float32),
-        np.zeros(len(order), dtype=np.float32),
+        np.zeros(len(order) + len(enters), dtype=np.float32),
         openings,
         start,
-        grid.by_layer,
+        grid.by_layer[0],
         addressing.place[domain.link_cell[opening_links]],
         domain.link_direction[opening_links],
         wanted,
@@ -300,6 +319,11 @@ def build_links(case: FlowCase, grid: Grid, scales: Scales, close_up: CloseUp | 
         of_wires := np.flatnonzero(domain.link_is_wire[order]).astype(np.int32),
         domain.link_direction[order[of_wires]],
     )
+
+
+def behind(addressing: Addressing) -> int:
+    """Return the first address behind the populations, up to which `d3q19.update` may read without effect."""
+    return 19 * addressing.stride + lanes.COUNT
 
 
 def wall_weights(

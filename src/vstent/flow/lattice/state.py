@@ -5,15 +5,17 @@ A *check* is a moment at which the monitored quantities are recorded and converg
 
 from collections import deque
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vstent.flow import domain as domains
+from vstent.flow import sampling
 from vstent.flow.case import FlowCase
-from vstent.flow.lattice.close_up import CloseUp
 from vstent.flow.lattice.kernels import d3q19
+from vstent.flow.lattice.levels import Interface
 from vstent.flow.lattice.scales import Scales
 from vstent.flow.lattice.screen import ScreenEntries
 from vstent.flow.lattice.setup import Addressing, Links, Refill
@@ -119,8 +121,6 @@ class State:
 
     case: FlowCase
     """The flow case."""
-    close_up: CloseUp | None
-    """Refined region and the flow around it; None: the grid covers the whole vessel."""
     domain: domains.Domain
     """The grid."""
     addressing: Addressing
@@ -133,8 +133,6 @@ class State:
     """Links for the present time step length."""
     screen: ScreenEntries
     """Screen for the present time step length."""
-    probe: Probe
-    """Places of the monitored quantities."""
     refill: Refill
     """Redistribution of the mass lost at the walls."""
     bands: Ints
@@ -163,11 +161,28 @@ class State:
     """Time at which a GPU began the next time steps, which it makes while the host judges the last check; else None."""
     device: Any = None
     """The run on a GPU (`on_gpu.Device`), once it has been copied there; else None."""
+    finer: "State | None" = None
+    """The next finer level, which shares the history of the run; None: this is the finest."""
+    interface: Interface | None = None
+    """Coupling with the next finer level."""
 
     @property
-    def has_resistances(self) -> bool:
-        """Return whether the flow out follows the pressure; in a refined region it is that of the surrounding flow."""
-        return self.close_up is None and bool(self.case.resistances)
+    def levels(self) -> "tuple[State, ...]":
+        """Return this grid and the finer ones inside it, coarse to fine."""
+        return (self,) if self.finer is None else (self, *self.finer.levels)
+
+    @property
+    def finest(self) -> "State":
+        """Return the level with the finest grid."""
+        return self.levels[-1]
+
+    @cached_property
+    def probe(self) -> Probe:
+        """Places of the monitored quantities."""
+        points_mm, area_mm2 = np.zeros((0, 3)), np.zeros((0, 3))
+        if self.case.ostium is not None:
+            points_mm, area_mm2 = sampling.surface_samples(self.case.ostium, self.domain.cell_size_mm)
+        return Probe(domains.cells_of_sac(self.case, self.domain), self.domain.places(points_mm), area_mm2)
 
     @property
     def steps_per_check(self) -> int:

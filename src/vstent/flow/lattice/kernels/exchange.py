@@ -1,0 +1,140 @@
+"""Exchange of populations between a grid and a finer one inside it, and the mass that crosses their interface.
+
+Populations of both grids must be at home (see `vstent.flow.lattice.kernels.d3q19`).
+"""
+
+from typing import Any, Final
+
+import numpy as np
+from numba import njit, prange
+
+from vstent.flow.lattice.kernels.collision import carried, moments_of, stress_size, thinned
+from vstent.flow.lattice.kernels.d3q19 import OPPOSITE
+from vstent.kernels.directions import VELOCITIES
+
+_HALF = np.float32(0.5)
+_AXES: Final = VELOCITIES.astype(np.float32)
+_EVEN: Final = 16
+"""Number of values per cell that are interpolated with the weights of the even part: those before the odd part."""
+_VALUES: Final = 25
+"""Number of values per cell: rest population, half sums of pairs (9), products u u (6), half differences (9)."""
+
+
+@njit(cache=True, forceinline=True, error_model="numpy")
+def _split(f: Any, stride: int, at: int, values: Any) -> None:
+    """Write the `_VALUES` of the cell with storage place `at`."""
+    x = y = z = np.float32(0.0)
+    values[0] = f[at]
+    for k in range(9):
+        q = 2 * k + 1
+        first, second = f[q * stride + at], f[(q + 1) * stride + at]
+        values[1 + k], values[_EVEN + k] = _HALF * (first + second), _HALF * (first - second)
+        x += _AXES[q, 0] * (first - second)
+        y += _AXES[q, 1] * (first - second)
+        z += _AXES[q, 2] * (first - second)
+    values[10], values[11], values[12] = x * x, y * y, z * z
+    values[13], values[14], values[15] = x * y, x * z, y * z
+
+
+@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
+def carry(f: Any, stride: int, stencil: Any, push: Any, into: Any, numbers: Any) -> None:
+    """Set populations of a grid by interpolation from those of another (see `collision.carried`).
+
+    Parameters
+    ----------
+    f, stride : populations of the source and distance between two of a cell.
+    stencil : tuple; (c,) int32 storage places of the source cells read, (n + 1,) int32 first entry of every target
+        cell, (e,) int32 number of a source cell, (e, 2) float32 its weight for the even and for the odd part of the
+        populations, (n,) int32 group of every target cell, and (n, 3) float32 its part in the momentum of
+        its group.
+    push : (g,) momentum added to the cells of every group.
+    into : tuple; populations and stride of the target, (n,) int32 storage place of every target cell, and (n,) float32
+        largest grid Reynolds number there.
+    numbers : tuple of float32; ratio of the spacing of the target to that of the source, relaxation time of the source,
+        its (4,) Carreau-Yasuda law, and relaxation rates of the odd part on the source and on the target.
+    """
+    place, start, cell, weight, group, part = stencil
+    g, new_stride, new_place, limit = into
+    ratio, time, law, odd_rate, new_odd_rate = numbers
+    read = np.zeros((len(place), _VALUES), np.float32)
+    for c in prange(len(place)):
+        _split(f, stride, place[c], read[c])
+    for i in prange(len(new_place)):
+        values, held = np.zeros(_VALUES, np.float32), np.zeros(19, np.float32)
+        for e in range(start[i], start[i + 1]):
+            of_cell = read[cell[e]]
+            for k in range(_EVEN):
+                values[k] += weight[e, 0] * of_cell[k]
+            for k in range(_EVEN, _VALUES):
+                values[k] += weight[e, 1] * of_cell[k]
+        held[0] = values[0]
+        x, y, z = part[i]
+        for k in range(9):
+            c = _AXES[2 * k + 1]
+            along = push[group[i]] * (c[0] * x + c[1] * y + c[2] * z) / (6.0 if k < 3 else 12.0)
+            odd = values[_EVEN + k] + np.float32(along)
+            held[2 * k + 1], held[2 * k + 2] = values[1 + k] + odd, values[1 + k] - odd
+        old_time = time
+        if law[0] > 0.0:
+            old_time = np.float32(thinned(stress_size(held), time, law))
+        new_time = _HALF + (old_time - _HALF) / ratio
+        squares = values[10], values[11], values[12], values[13], values[14], values[15]
+        new = carried(held, squares, ratio, (old_time, limit[i], odd_rate), (new_time, limit[i], new_odd_rate))
+        for q in range(19):
+            g[OPPOSITE[q] * new_stride + new_place[i]] = new[q]
+
+
+@njit(cache=True, parallel=True)
+def add_crossed(f: Any, first: int, start: Any, part: float, crossed: Any) -> None:
+    """Add `part` of the mass that crossed a border in the last pair of steps to `crossed` (g,) of every group.
+
+    Group g holds the links from `start[g]` to `start[g + 1]`; what crossed along them in both steps is stored in `f`
+    from address `first` on (see `setup.Links`).
+    """
+    for g in prange(len(crossed)):
+        total = 0.0
+        for k in range(start[g], start[g + 1]):
+            total += float(f[first + k]) + float(f[first + start[-1] + k])
+        crossed[g] += part * total
+
+
+@njit(cache=True, error_model="numpy")
+def _density(f: Any, stride: int, at: int, part: float) -> Any:
+    """Return the density deviation of the cell with storage place `at` on a grid of another spacing.
+
+    `part` is that of its correction in shear flow (see `collision.carried`); 0 on the same grid.
+    """
+    held = np.zeros(19, np.float32)
+    for q in range(19):
+        held[q] = f[q * stride + at]
+    density, u, flux = moments_of(held)
+    trace = flux[0] + flux[1] + flux[2] - (u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
+    return density + np.float32(part) * (trace - density)
+
+
+@njit(cache=True)
+def add_jump(f: Any, stride: int, g: Any, new_stride: int, overlap: Any, parts: Any, push: Any) -> None:
+    """Add the density of a grid less that of the finer one in the same cells to `push` (g,) of every group.
+
+    Parameters
+    ----------
+    f, stride, g, new_stride : populations and strides of both grids.
+    overlap : tuple; (m,) storage places of coarser cells, (m, 8) of the finer ones in each, and (m,) their groups.
+    parts : tuple; factor of the difference, and of the correction in `_density`.
+    """
+    place, finer, group = overlap
+    for c in range(len(place)):
+        difference = float(_density(f, stride, place[c], parts[1]))
+        for n in range(finer.shape[1]):
+            difference -= float(_density(g, new_stride, finer[c, n], 0.0)) / finer.shape[1]
+        push[group[c]] += parts[0] * difference
+
+
+@njit(cache=True)
+def take(f: Any, place: Any, group: Any, share: Any, lack: Any) -> None:
+    """Take a mass `lack` (g,) from the cells of every group, whose rest populations are stored at `place` (c,).
+
+    `group` (c,) are the groups of the cells, and `share` (c,) their parts in what the group gives.
+    """
+    for c in range(len(place)):
+        f[place[c]] -= np.float32(share[c] * lack[group[c]])

@@ -1,0 +1,387 @@
+"""Nested levels: each grid is refined by a factor of two in a part of the vessel, and both grids are coupled both ways.
+
+The coarsest level covers the whole vessel with its openings; a finer one lies inside the next coarser one. Both have
+the same speeds in lattice units, so that a finer level makes two time steps for one. Populations are at home only after
+a pair of steps. Levels therefore overlap and exchange once per coarse pair, in which the finer one makes two pairs. The
+kernels of collision and streaming know nothing of levels.
+
+Cells of the coarser grid in a refined part are counted in *layers* from its rim. At an exchange, populations of finer
+cells in the layers `CARRIED_DOWN` are interpolated from the coarser grid, and those of coarser cells in the layers
+`CARRIED_UP` from the finer one. What is wrong at the edge of a grid moves one cell per step, so that it is overwritten
+before it reaches the layer between. Interpolation is cubic (Lagrava, Malaspinas, Latt and Chopard 2012, J. Comput.
+Phys. 231, 4808), and a least-squares fit in which the velocity vanishes at the wall where that leaves gaps in the
+stencil; the non-equilibrium is rescaled (`collision.carried`).
+
+Interpolation alone does not keep mass. On the border between the third and fourth layer the mass that crosses it on
+either grid is therefore compared, and what crossed on the finer grid counts for both: the difference is returned to the
+coarser cells beside the border (Berger and Colella 1989, J. Comput. Phys. 82, 64). The volumetric scheme of Rohde et
+al. 2006 keeps mass as well, but it needs an exchange in each step, and walls that agree on both grids.
+
+The same flow rate has velocities on both grids that differ by some thousandths, because their cells fill a section
+differently. Blood that is set anew in each exchange would have to be accelerated by that between two of them: a border
+across a tube of six coarse cells would take the pressure that falls over two cells. Momentum normal to the border is
+therefore added to the cells that are set. It is integrated from what remains: on the coarser grid the mass that crosses
+too much, on the finer one the difference of pressure between both grids in the layer between.
+"""
+
+from dataclasses import dataclass, replace
+from math import pi, sqrt
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.spatial import cKDTree
+
+from vstent.errors import FlowError
+from vstent.flow import domain as domains
+from vstent.flow.case import FlowCase
+from vstent.flow.domain import Domain, Window
+from vstent.flow.lattice.kernels import d3q19
+from vstent.flow.lattice.setup import Crossings, Grid, address, behind, thickest
+from vstent.geometry.surface import Surface
+from vstent.kernels.arrays import Bools, Floats, Ints
+from vstent.kernels.directions import VELOCITIES
+
+WIDTH: Final = 2
+"""Ratio of the grid spacings of two levels, and of their time steps."""
+CARRIED_DOWN: Final = (1, 2)
+"""Layers in which the finer level is set from the coarser one."""
+CARRIED_UP: Final = (4, 5)
+"""Layers in which the coarser level is set from the finer one."""
+OWN_LAYER: Final = 4
+"""First layer in which the finer level counts: mass that crosses into it is compared."""
+RIM: Final = 3
+"""Number of layers added around the cells to be refined."""
+OPENING_CELLS: Final = 2
+"""Distance in cells to which a refined part approaches the end of an opening, which only the coarsest level has."""
+GROUP: Final = 24
+"""Extent in cells of the pieces of a border in which crossed mass is compared. In smaller ones the cells beside the
+wall, whose faces differ on both grids, disturb the profile."""
+LACK_PART: Final = 0.15
+"""Under-relaxation factor with which the mass returned to the coarser level follows what crossed."""
+PUSH_PART: Final = 0.05
+"""Part of the momentum still missing at a border that is added in each exchange."""
+UPSTREAM_DIAMETERS, DOWNSTREAM_DIAMETERS = 5.0, 1.0
+"""Extent of the refined part from the sac towards the inlet and the outlets, in mean diameters 4 V / A of the vessel.
+The flow into the sac forms upstream: beside the same spacing everywhere (0.14 mm) the demo's neck inflow is 9 % lower
+with one diameter, 1 % lower with two, 3 % higher with three and 1 % higher with five."""
+SHARES: Final = (1.0, 1 / 3)
+"""Part of the allowed time steps of a steady flow that a run makes, without and with finer levels. With these it is
+small, because the run starts from the flow on the coarsest level."""
+CHANGING: Final = ("crossed", "lack", "push")
+"""Arrays of an `Interface` that change during a run."""
+REACH: Final = 1.2
+"""Standard deviation in cells of the weights of a fit beside a wall."""
+RIDGE: Final = 1e-3
+"""Weight with which the derivatives of such a fit are drawn to zero, where too few cells determine them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stencil:
+    """Interpolation from cells of one grid to cells of another."""
+
+    place: Ints
+    """(c,) storage places of the cells read."""
+    start: Ints
+    """(n + 1,) first entry of each target cell."""
+    cell: Ints
+    """(e,) number, among these cells, of the one read."""
+    weight: NDArray[np.float32]
+    """(e, 2) weights of the even and of the odd part of the populations."""
+    target: Ints
+    """(n,) storage places of the target cells."""
+    limit: NDArray[np.float32]
+    """(n,) largest grid Reynolds number there (see `setup.thickest`)."""
+    group: Ints
+    """(n,) group of each of them."""
+    share: NDArray[np.float32]
+    """(n, 3) what it gets of the momentum added to its group normal to the border, in proportion to the wall
+    distance."""
+
+
+@dataclass(frozen=True, eq=False)
+class Interface:
+    """Coupling of a grid and the next finer one; `crossed`, `lack` and `push` change in place during a run."""
+
+    down: Stencil
+    """From the coarser to the finer grid."""
+    up: Stencil
+    """From the finer to the coarser grid."""
+    border: tuple[Crossings, Crossings]
+    """What crosses the border on the coarser and on the finer grid."""
+    beside: Ints
+    """(c,) storage places of the cells of the coarser grid outside the border."""
+    group: Ints
+    """(c,) their groups."""
+    share: Floats
+    """(c,) part of each in what its group returns, in proportion to the wall distance."""
+    crossed: Floats
+    """(g,) mass that crossed on the finer grid since the last exchange and not on the coarser one, in coarse cells."""
+    lack: Floats
+    """(g,) mass taken from the cells beside the border before every pair of steps of the coarser grid."""
+    between: tuple[Ints, Ints, Ints]
+    """Cells of both grids in the layer that neither sets (see `exchange.add_jump`)."""
+    push: Floats
+    """(2, g) momentum into the finer grid that is added to the cells set on the finer and on the coarser grid."""
+    is_trusted: Bools
+    """(n,) whether each cell of the finer grid lies inside the border."""
+
+    def anew(self) -> "Interface":
+        """Return the same coupling for another run."""
+        return replace(self, **{name: np.zeros_like(getattr(self, name)) for name in CHANGING})
+
+    def twin(self) -> "Interface":
+        """Return the same coupling in its present state, for a run that goes its own way."""
+        return replace(self, **{name: getattr(self, name).copy() for name in CHANGING})
+
+
+def require_sac(case: FlowCase) -> Surface:
+    """Return the sac of a case, around which the grid is refined; raise a `FlowError` where there is none."""
+    if case.sac is None:
+        raise FlowError(
+            "the grid cannot be refined in the sac, because this vessel has none: switch that off (--refine-sac)"
+        )
+    return case.sac
+
+
+def near_sac(case: FlowCase, grid: Domain) -> Bools:
+    """Return whether each cell (n,) lies in the sac or in the artery near it."""
+    # The distances, mm, between neighbouring cells that are not separated by the wall.
+    neighbour = grid.neighbours()
+    is_open = neighbour >= 0
+    is_open[:, 0::2] = False  # count every pair once
+    is_open[grid.septum_cell, grid.septum_direction] = False
+    cell, direction = np.nonzero(is_open)
+    length_mm = grid.cell_size_mm * np.linalg.norm(VELOCITIES, axis=1)[direction]
+    places = cell, neighbour[cell, direction]
+    graph = csr_matrix(coo_matrix((length_mm, places), shape=(len(grid.cells),) * 2))
+    distance_mm = dijkstra(graph, directed=False, indices=domains.cells_of_sac(case, grid), min_only=True)
+    diameter_mm = domains.mean_diameter_mm(case.vessel)
+    is_near = distance_mm <= DOWNSTREAM_DIAMETERS * diameter_mm
+    piece = np.full(len(distance_mm), -1)
+    piece[~is_near] = connected_components(graph[~is_near][:, ~is_near], directed=False)[1]
+    leads_in = grid.link_cell[(grid.link_patch > 0) & (grid.link_patch <= len(case.vessel.inlets))]
+    is_upstream = (piece >= 0) & np.isin(piece, piece[leads_in])
+    return is_near | (is_upstream & (distance_mm <= UPSTREAM_DIAMETERS * diameter_mm))
+
+
+def volume_mm3(case: FlowCase, coarse_mm: float) -> float:
+    """Estimate the volume of the refined part of a case, the sac and a piece of the artery."""
+    sac, diameter_mm = require_sac(case), domains.mean_diameter_mm(case.vessel)
+    neck_mm2 = 0.0 if case.ostium is None else case.ostium.area_mm2
+    stretch_mm = (UPSTREAM_DIAMETERS + DOWNSTREAM_DIAMETERS) * diameter_mm + sqrt(4 / pi * neck_mm2)
+    stretch_mm += 2 * RIM * coarse_mm
+    return min(abs(sac.volume_mm3) + pi / 4 * diameter_mm**2 * stretch_mm, abs(case.vessel.closed.volume_mm3))
+
+
+def window(grid: Domain, is_wanted: Bools) -> tuple[Window, Ints]:
+    """Return the part of a grid to be refined around wanted cells (n,), and the layer of every point of the grid.
+
+    The layer is 0 outside the part; `CARRIED_UP` and deeper ones have the same number.
+    """
+    full, shape = np.ones((3, 3, 3), dtype=bool), grid.index.shape
+    blood, within, ends = grid.index >= 0, np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+    within[tuple(grid.cells[is_wanted].T)] = True
+    ends[tuple(grid.cells[grid.link_cell[grid.link_patch > 0]].T)] = True
+    within = ndimage.binary_dilation(within, full, RIM, mask=blood)
+    within &= ~ndimage.binary_dilation(ends, full, OPENING_CELLS)
+    front = blood & ~within
+    within |= ndimage.binary_dilation(within, full) & ~blood  # finer cells may lie between coarser ones and the wall
+    layer = np.where(within, CARRIED_UP[-1] + 1, 0)
+    for number in range(1, CARRIED_UP[-1] + 1):
+        front = ndimage.binary_dilation(front, full) & (layer > CARRIED_UP[-1])
+        layer[front] = number
+    low = np.argwhere(within).min(axis=0) - 1
+    part = within[tuple(slice(a, b) for a, b in zip(low, np.argwhere(within).max(axis=0) + 2, strict=True))]
+    fine = part.repeat(WIDTH, axis=0).repeat(WIDTH, axis=1).repeat(WIDTH, axis=2)
+    size_mm = grid.cell_size_mm / WIDTH
+    return Window(grid.origin_mm + low * grid.cell_size_mm - 0.5 * (grid.cell_size_mm - size_mm), fine), layer
+
+
+def count(case: FlowCase) -> int:
+    """Return the number of levels of a case; raise a `FlowError` where there is no sac to refine."""
+    return 2 if case.numerics.close_up and require_sac(case) else 1
+
+
+def refined(case: FlowCase, coarse: Grid, wires: Surface | None) -> tuple[Grid, Grid, Interface]:
+    """Return a grid, the next finer one in it with `wires` as walls, and the coupling of both."""
+    wide = coarse.domain
+    part, layer = window(wide, near_sac(case, wide))
+    domain = domains.build(case.vessel, wide.cell_size_mm / WIDTH, part, wires)
+    limit = thickest(case, domain)
+    addressing = address(domain, limit)
+    layers: Ints = layer[tuple(np.rint(wide.places(domain.centers_mm)).astype(int).T)]
+    # What is deferred at a wall would outlast the exchange that overwrites the cells at the rim.
+    is_kept = addressing.link_has_two & (layers > CARRIED_DOWN[-1])[domain.link_cell]
+    fine = Grid(domain, limit, replace(addressing, link_has_two=is_kept))
+    return _coupled(coarse, fine, layer[tuple(wide.cells.T)], layers)
+
+
+def _coupled(coarse: Grid, fine: Grid, layer_of_wide: Ints, layer_of_fine: Ints) -> tuple[Grid, Grid, Interface]:
+    """Return two grids with their border, and their coupling, from the layer of every cell (see `window`)."""
+    wide = coarse.domain
+    sides = layer_of_wide >= OWN_LAYER, layer_of_fine >= OWN_LAYER
+    links = [_crossing(grid, is_own) for grid, is_own in zip((coarse, fine), sides, strict=True)]
+    beside = np.unique(links[0][1])
+    group = _pieces(wide.cells[beside])
+    groups = int(group.max(initial=0)) + 1
+    nearest = cKDTree(wide.centers_mm[beside]) if len(beside) else None
+
+    def group_at(places_mm: Floats) -> Ints:
+        return group[nearest.query(places_mm)[1]] if nearest else np.zeros(len(places_mm), np.int32)
+
+    grids, border = [], []
+    for grid, is_own, (inside, outside, crossed) in zip((coarse, fine), sides, links, strict=True):
+        # Links that cross between the same two points share a group: along the border they carry mass to and fro.
+        of_link = group_at(0.5 * (grid.domain.centers_mm[inside] + grid.domain.centers_mm[outside]))
+        order = np.argsort(of_link, kind="stable")
+        start = np.searchsorted(of_link[order], np.arange(groups + 1)).astype(np.int32)
+        first = behind(grid.addressing) + 2 * sum(len(one.cell) for one in grid.crossings)
+        border.append(Crossings(inside[order], crossed[order], start, first))
+        side = is_own + 2 * (0 if grid.side is None else grid.side)
+        grids.append(replace(grid, crossings=(*grid.crossings, border[-1]), side=side.astype(np.int32)))
+        ahead_mm = grid.domain.centers_mm[inside] - grid.domain.centers_mm[outside]
+    # Of a closed piece the directions cancel: it has no flow rate to keep.
+    size_mm = np.bincount(of_link, np.linalg.norm(ahead_mm, axis=1), groups)
+    total_mm = np.stack([np.bincount(of_link, along_mm, groups) for along_mm in ahead_mm.T], axis=1)
+    normal = total_mm / np.maximum(size_mm, 1e-300)[:, None]
+
+    def carried(read: Grid, written: Grid, target: Ints) -> Stencil:
+        of_cell = group_at(written.domain.centers_mm[target])
+        share = _shares(of_cell, written.domain.depth_mm[target], groups)[:, None] * normal[of_cell]
+        return stencil(read, written, target, of_cell, share)
+
+    corner = fine.domain.cell_size_mm * (np.indices((WIDTH,) * 3).reshape(3, -1).T - 0.5)
+    middle: Ints = np.flatnonzero(layer_of_wide == OWN_LAYER - 1)
+    finer = np.stack([fine.domain.cells_at(wide.centers_mm[middle] + offset) for offset in corner], axis=1)
+    middle, finer = middle[(finer >= 0).all(axis=1)], finer[(finer >= 0).all(axis=1)]
+    coupling = Interface(
+        carried(coarse, fine, np.flatnonzero(np.isin(layer_of_fine, CARRIED_DOWN))),
+        carried(fine, coarse, np.flatnonzero(np.isin(layer_of_wide, CARRIED_UP))),
+        (border[0], border[1]),
+        coarse.addressing.place[beside],
+        group,
+        _shares(group, wide.depth_mm[beside], groups),
+        np.zeros(groups),
+        np.zeros(groups),
+        (coarse.addressing.place[middle], fine.addressing.place[finer], group_at(wide.centers_mm[middle])),
+        np.zeros((2, groups)),
+        sides[1],
+    )
+    return grids[0], grids[1], coupling
+
+
+def _shares(group: Ints, size: Floats, groups: int) -> Floats:
+    """Return the part (c,) of each cell in the total size of its group."""
+    return size / np.bincount(group, size, groups)[group]
+
+
+def _pieces(cells: Ints) -> Ints:
+    """Return the group (c,) of each cell of a border: connected cells, halved until they extend over `GROUP` cells."""
+    near = cKDTree(cells).query_pairs(1.8, output_type="ndarray")
+    joins = coo_matrix((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=(len(cells), len(cells)))
+    group: Ints = np.asarray(connected_components(joins, directed=False)[1], dtype=np.int32)
+    left = list(range(int(group.max(initial=-1)) + 1))
+    while left:
+        members = np.flatnonzero(group == left[-1])
+        extent = np.ptp(cells[members], axis=0)
+        if extent.max() <= GROUP:
+            left.pop()
+            continue
+        along = cells[members, extent.argmax()]
+        group[members[along > np.median(along)]] = group.max() + 1
+        left.append(int(group.max()))
+    return group
+
+
+def _crossing(grid: Grid, is_own: Bools) -> tuple[Ints, Ints, Ints]:
+    """Return cells inside (l,) and outside (l,) of a part (n,) of a grid, and addresses (l, 2) as in `Crossings`."""
+    domain, addressing = grid.domain, grid.addressing
+    ahead = domain.neighbours()
+    crosses = (ahead >= 0) & is_own[:, None] & ~is_own[ahead]
+    first, direction = domain.septum_cell, domain.septum_direction
+    crosses[first, direction] = False
+    crosses[ahead[first, direction], d3q19.OPPOSITE[direction]] = False
+    inside, q = np.nonzero(crosses)
+    outside = ahead[inside, q]
+    enters = d3q19.OPPOSITE[q] * addressing.stride + addressing.place[inside]
+    leaves = q * addressing.stride + addressing.place[outside]
+    return inside, outside, np.column_stack([enters, leaves]).astype(np.int32)
+
+
+def stencil(read: Grid, written: Grid, target: Ints, group: Ints, share: Floats) -> Stencil:
+    """Return the interpolation from cells of one grid to cells `target` (n,) of another (see `Stencil`).
+
+    Those with no cell of the first grid near them are left out.
+    """
+    source, other = read.domain, written.domain
+    at = source.places(other.centers_mm[target])
+    corner = np.floor(at).astype(int)
+    offset = np.indices((4, 4, 4)).reshape(3, -1).T - 1
+    around = corner[:, None] + offset
+    index = np.pad(source.index, 4, constant_values=-1)
+    limit: Ints = np.array(index.shape) - 1
+    cell = index[tuple(np.moveaxis(np.clip(around + 4, 0, limit), -1, 0))]
+    of_septa = np.zeros(len(source.cells) + 1, dtype=bool)
+    of_septa[source.septum_cell] = True
+    is_whole = ((cell >= 0) & ~of_septa[cell]).all(axis=1)
+    t = (at - corner)[..., None]
+    nodes = np.array([-1, 0, 1, 2])
+    others = np.array([[0, 1, 2], [-1, 1, 2], [-1, 0, 2], [-1, 0, 1]])
+    cubic = (t[..., None] - others).prod(axis=3) / (nodes[:, None] - others).prod(axis=1)  # Lagrange's polynomials
+    even = np.einsum("ma,mb,mc->mabc", cubic[:, 0], cubic[:, 1], cubic[:, 2]).reshape(len(at), -1)
+    odd = even.copy()
+    beside = np.flatnonzero(~is_whole)
+    if len(beside):
+        away = offset - (at - corner)[beside][:, None]
+        even[beside], odd[beside] = _beside_wall(source, other, target[beside], cell[beside], away)
+    is_used = (cell >= 0) & (even != 0)
+    is_near = is_used.any(axis=1)
+    is_used, cell, even, odd = (values[is_near] for values in (is_used, cell, even, odd))
+    target, group, share = (values[is_near] for values in (target, group, share))
+    start = np.r_[0, np.cumsum(is_used.sum(axis=1))].astype(np.int32)
+    weight = np.stack([even[is_used], odd[is_used]], axis=1).astype(np.float32)
+    place, number = np.unique(read.addressing.place[cell[is_used]], return_inverse=True)
+    return Stencil(
+        place,
+        start,
+        number.astype(np.int32),
+        weight,
+        written.addressing.place[target],
+        written.limit[target],
+        group,
+        share.astype(np.float32),
+    )
+
+
+def _beside_wall(source: Domain, other: Domain, target: Ints, cell: Ints, away: Floats) -> tuple[Floats, Floats]:
+    """Return the weights (m, 64) of a fit to cells (m, 64) of `source`, -1 for none, at cells `target` (m,).
+
+    The even part of the populations is fitted as linear, the odd part as the wall distance times a quadratic function.
+    `away` (m, 64, 3) is the distance of the cells from the target in cells. Cells behind a wall do not count.
+    """
+    is_blood = cell >= 0
+    row, column = np.nonzero(is_blood)
+    from_mm = other.centers_mm[target]
+    hidden = source.surface.crosses(from_mm[row], source.centers_mm[cell[row, column]])
+    is_blood[row[hidden], column[hidden]] = False
+    depth_mm = source.depth_mm[cell]
+    x, y, z = np.moveaxis(away, 2, 0)
+    basis = np.stack([np.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z], axis=2)
+    trust = is_blood * np.exp(-0.5 * (away**2).sum(axis=2) / REACH**2)
+    own_mm = other.depth_mm[target]
+    return _fitted(trust, basis[:, :, :4]), _fitted(trust, basis * depth_mm[:, :, None]) * own_mm[:, None]
+
+
+def _fitted(trust: Floats, basis: Floats) -> Floats:
+    """Return the weights (m, k) with which values give the first coefficient of a fit with a basis (m, k, b)."""
+    matrix = np.einsum("mk,mki,mkj->mij", trust, basis, basis)
+    size = matrix[:, :1, 0] + 1e-12
+    terms = np.arange(matrix.shape[1])
+    matrix[:, terms[1:], terms[1:]] += RIDGE * size
+    matrix[:, 0, 0] += 1e-9
+    unit = np.broadcast_to(np.eye(len(terms))[0][:, None], (len(matrix), len(terms), 1))
+    return np.asarray(trust * np.einsum("mki,mi->mk", basis, np.linalg.solve(matrix, unit)[..., 0]))
