@@ -1,5 +1,6 @@
 """Coils in sacs: distances by brute force over all pairs of segments, lengths, loops, zones and refusals."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -12,15 +13,16 @@ from vstent.deployment.coils import bend_radii_mm, deploy_coils, measure_coils, 
 from vstent.deployment.deploy import deploy
 from vstent.deployment.struts import struts
 from vstent.devices.catalogue import find_design, find_size
+from vstent.devices.ranges import altered, values_at
 from vstent.devices.stent import Landing
-from vstent.devices.treatment import read_treatment
+from vstent.devices.treatment import Treatment, read_treatment
 from vstent.errors import InputError, LandingError
 from vstent.geometry.surface import Surface
 from vstent.kernels import rods
 from vstent.plan.ranges import Ranges
-from vstent.plan.uncertainty import COIL_RESULTS, vary_seeds
+from vstent.plan.uncertainty import COIL_RESULTS, made_wider, vary, vary_seeds
 from vstent.reporting.uncertainty import uncertainty_of
-from vstent.study.keys import study_keys
+from vstent.study.keys import is_varied, study_keys
 from vstent.study.settings import Settings
 from vstent.study.stages import deploy_all, deploy_implant
 from vstent.study.store import Store
@@ -111,6 +113,45 @@ def test_the_spread_over_seeds_is_that_of_the_same_coils_placed_otherwise():
     assert told["shares"]["neck_density_fraction"] == {"rest_fraction": 1.0}
     (row,) = uncertainty_of({"treatments": {"coils": {"uncertainty": told}}}, {})
     assert row.words == "3 deployments. Varied: the seed, which places the catheter and turns the framing coil."
+
+
+def test_a_stent_and_the_coils_that_it_keeps_in_vary_together(tmp_path):
+    """Every sample is the stent as varied alone, with the same coils placed behind it with the next seed."""
+    sac, size = ball(4.0, 3.0), find_size(find_design("enterprise"), diameter_mm=4.5, length_mm=14)
+    kept = deploy("enterprise", sac, size=size, landing=Landing(8.0))
+    coils = deploy_coils(COILS, sac, 0.02, inside=[kept.stent], seed=2).stent
+    ranges = Ranges(samples=2, landing_mm=0.5, device_mm=0.05)
+    both, alone = vary(sac, kept, ranges, [coils]), vary(sac, kept, ranges)
+    assert both.names == (*alone.names, *COIL_RESULTS)
+    np.testing.assert_array_equal(both.values[:, : len(alone.names)], alone.values)
+    assert both.n_failed == 0
+    design, made = altered(kept.stent.design, size, values_at(ranges.numbers_of(kept.stent.design), both.points[1, 4:]))
+    made = made_wider(design, made, 0.05 * both.points[1, 2])
+    stent = deploy(design, sac, size=made, landing=Landing(kept.stent.middle_abscissa_mm + 0.5 * both.points[1, 1]))
+    again = measure_coils(sac, deploy_coils(COILS, sac, coils.coils, inside=[stent.stent], seed=3).stent)
+    assert both.values[1, -3:].tolist() == [again[name] for name in COIL_RESULTS]
+    (row,) = uncertainty_of({"treatments": {"both": {"uncertainty": both.metrics()}}}, {})
+    assert "landing ±0.500" in row.words
+    assert row.words.endswith("catalogue, the seed, which places the catheter and turns the framing coil.")
+
+
+@pytest.mark.parametrize(
+    ("text", "is_so"),
+    [
+        ("bare", False),
+        ("enterprise", True),
+        ("coils", True),
+        ("enterprise + coils(20%)", True),
+        ("enterprise & coils", False),
+        ("silk + silk", False),
+        ("silk + silk + coils", False),
+    ],
+)
+def test_one_device_varies_alone_or_with_coils(text, is_so):
+    treatment = Treatment("bare") if text == "bare" else read_treatment(text)
+    assert is_varied(treatment) is is_so
+    settings = replace(Settings(), treatments=(treatment,), flow=None, uncertainty=Ranges())
+    assert (f"vary {treatment.name}" in study_keys("", settings)) is is_so
 
 
 def test_zones_share_out_all_coil():

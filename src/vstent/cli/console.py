@@ -60,7 +60,7 @@ DEVICE_ROWS: Final = (
     ("Apposed", "apposed_fraction"),
     ("Metal coverage over the neck", "neck_metal_coverage_fraction"),
     ("Basket, height", "basket_height_mm"),
-    ("Basket, stands out into the artery", "protrusion_mm"),
+    ("Stands out into the artery", "protrusion_mm"),
     ("Basket, neck left open", "neck_uncovered_fraction"),
     ("Coils, packing density", "packing_density_fraction"),
     ("Coils, length of all", "coil_length_mm"),

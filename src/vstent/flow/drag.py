@@ -27,10 +27,13 @@ BLUNTED = 0.8
 """Ratio of the slowing by a band that drags least where the blood is slowest to the slowing by a uniform band. With
 this value, rows of wires 0.03 to 0.09 mm thick and 4 to 16 cells apart resist slow flow within 2 % of their drag law
 (`test_screen_sheet.py`)."""
-KOZENY = 4.09, 0.72
-"""Kozeny constant c = a + b / density of coils: 6.4 at 31 % and 9.0 at 15 %, within 1 % of resolved wires along three
-axes (`benchmarks/meshes.py`, `meshes.json`). Random fibres have 6 to 7 (Jackson and James 1986, Can. J. Chem. Eng. 64,
-364)."""
+KOZENY = 3.3, 0.37
+"""Kozeny constant c = a + b / density of coils: 4.5 at 31 % and 5.8 at 15 %, within 15 % of resolved cubes cut from
+placed coils. Their loops lie side by side and leave larger pores than straight wires along three axes, which have 6.4
+and 9.0, or random fibres with 6 to 7 (`benchmarks/meshes.py`, `meshes.json`; Jackson and James 1986, Can. J. Chem. Eng.
+64, 364)."""
+WINDING = 1.14
+"""Mean speed between coils over that of the blood's way through them: 1.07 to 1.22 in those cubes."""
 COIL_INERTIA = 0.024
 """Increase of the resistance of coils per Reynolds number of their diameter and the superficial speed: resolved wires
 resist 1.23 to 1.26 times as much at 10 as in creeping flow, at 15 to 31 % (`benchmarks/meshes.py`, `meshes.json`)."""

@@ -8,6 +8,7 @@ import numpy as np
 from vstent.flow import sampling
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.domain import mean_diameter_mm
+from vstent.flow.drag import WINDING
 from vstent.flow.ends import FlowRate, outflows
 from vstent.flow.ostium import sac_surfaces
 from vstent.geometry.surface import Surface
@@ -100,13 +101,14 @@ def between_coils(found: dict[str, float], porosity: float) -> dict[str, float]:
     """Return the indices of a flow in which coils are a porous region, for the blood between them alone.
 
     `porosity` is the blood's part of the sac: there is less of it, and it is faster than the velocity of the region,
-    which is the flow rate per area of blood and coils.
+    which is the flow rate per area of blood and coils, also because it winds between them (`vstent.flow.drag.WINDING`).
     """
+    winding = WINDING if porosity < 1 else 1.0
     factors = {
         "turnover_time_s": porosity,
         "fast_sac_volume_mm3": porosity,
-        "mean_sac_velocity_m_s": 1 / porosity,
-        "sac_kinetic_energy_J": 1 / porosity,
+        "mean_sac_velocity_m_s": winding / porosity,
+        "sac_kinetic_energy_J": winding**2 / porosity,
     }
     return {name: value * factors.get(name, 1.0) for name, value in found.items()}
 

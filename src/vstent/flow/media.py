@@ -28,8 +28,9 @@ SAMPLE_REACHES = 0.2
 """Maximum edge between the surface samples that measure the area of such a neighbourhood, in its radii."""
 REGION_MM = 0.15
 """Spacing of the samples of a region of coils."""
-AROUND_COILS = 2.5
-"""Radius of the neighbourhood in which the density of coils is measured, in wound diameters."""
+AROUND_COILS = 1.0
+"""Radius of the neighbourhood in which the density of coils is measured, in wound diameters: a wider one fills the gap
+between the neck and the first loops (`benchmarks/coils.py`)."""
 SPARSEST_COILS, DENSEST_COILS = 0.005, 0.6
 """Local densities below which coils do not resist, and above which they do as at this one."""
 PIECE_MM = 0.05

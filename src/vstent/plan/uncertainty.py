@@ -4,11 +4,11 @@ Four causes are varied, each uniformly within plus or minus its range and indepe
 the scan (all diameters), the landing position, the manufactured diameter of the device, and the mean inflow. The
 numbers of the device vary with them, each within its range in the catalogue (`vstent.devices.ranges`). In an artery
 that yields, so does the stiffness of the device relative to wall and bed. Points are those of a Sobol sequence, each in
-the middle of its stratum. Every cause alone is thus sampled evenly, and the same study gives the same result. Of coils
-the seed varies alone.
+the middle of its stratum. Every cause alone is thus sampled evenly, and the same study gives the same result. Every
+sample of coils has a seed of its own; of coils alone nothing else varies.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
@@ -151,6 +151,7 @@ def vary(
     anatomy: Anatomy,
     deployment: Deployment,
     ranges: Ranges,
+    coils: Sequence[Stent] = (),
     *,
     flow: FlowSettings | None = None,
     straightening: str = "off",
@@ -159,7 +160,8 @@ def vary(
 ) -> Uncertainty:
     """Repeat a deployment with its causes varied: artery, position of the middle row, size and numbers of the device.
 
-    The artery yields to the device as `straightening` states (`straighten`), off: it is rigid.
+    The same `coils` that it keeps in the sac are placed behind every sample, each time with another seed. The artery
+    yields to the devices as `straightening` states (`straighten`), off: it is rigid.
 
     The first ``ranges.flow_samples`` samples are computed with a flow of these settings and stored in `checkpoint`, so
     that an interrupted study resumes after the last of them. `progress` is called with the number of finished samples
@@ -182,8 +184,9 @@ def vary(
 
     def sample(number: int, wanted: FlowSettings | None) -> dict[str, float]:
         offset, at, place = np.split(points[number], [len(CAUSES), len(CAUSES) + len(numbers)])
-        how = straightening, float(place.sum())
-        return _sample(anatomy, deployment.stent, offset * spread, values_at(numbers, at), wanted, how)
+        how, made = (straightening, float(place.sum())), values_at(numbers, at)
+        again = [replace(one, seed=one.seed + number) for one in coils if isinstance(one, Coils)]
+        return _sample(anatomy, deployment.stent, offset * spread, made, again, wanted, how)
 
     names, values = _results(sample, len(points), ranges, flow, progress, checkpoint)
     half = [*(0.5 * (one.high - one.low) for one in numbers), *(1.0 for _ in yields)]
@@ -210,14 +213,10 @@ def vary_seeds(
 
     def sample(number: int, wanted: FlowSettings | None) -> dict[str, float]:
         placed = deploy_coils(coils.design.key, anatomy, coils.coils, seed=coils.seed + number)
-        measures = measure(anatomy, placed)
-        found = {name: float(measures[name]) for name in COIL_RESULTS}
+        found = _found(anatomy, placed)
         if wanted is None:
             return found
-        shapes, porosity = sac_surfaces(anatomy), 1.0 - found["packing_density_fraction"]
-        after = indices(simulate_case(flow_case(anatomy, (placed.stent,), wanted), start=bare(wanted)), *shapes)
-        after = after if wanted.numerics.wires == "resolved" else between_coils(after, porosity)
-        changes = ratios(indices(bare(wanted), *shapes), after)
+        changes = ratios(*_flows(anatomy, [placed], wanted, bare(wanted)))
         return found | {name: changes[name] for name in FLOW_RESULTS if name in changes}
 
     names, values = _results(sample, ranges.samples, ranges, flow, progress, checkpoint)
@@ -269,10 +268,11 @@ def _sample(
     stent: Stent,
     offset: Floats,
     made: Mapping[str, float],
+    coils: Sequence[Coils],
     flow: FlowSettings | None,
     how: tuple[str, float],
 ) -> dict[str, float]:
-    """Return the results with causes changed by `offset` (4,) and numbers `made`; empty if the device does not fit.
+    """Return the results with causes changed by `offset` (4,) and numbers `made`; empty if a device does not fit.
 
     `how` states how the artery yields: `setting` and `place` of `straighten`.
     """
@@ -281,32 +281,44 @@ def _sample(
     try:
         design, size = altered(stent.design, stent.size, made)
         size = made_wider(design, size, wider_mm)
-        deployed = deploy(design, other, size=size, landing=Landing(stent.middle_abscissa_mm + along_mm))
+        placed = [deploy(design, other, size=size, landing=Landing(stent.middle_abscissa_mm + along_mm))]
+        inside = [placed[0].stent]
+        placed += [deploy_coils(one.design.key, other, one.coils, inside=inside, seed=one.seed) for one in coils]
     except (DeviceError, LandingError):
         return {}
-    measures = measure(other, deployed)
-    found: dict[str, float] = {name: float(measures[name]) for name in RESULTS if name in measures}
+    found = {name: value for one in placed for name, value in _found(other, one).items()}
     yielded: Straightening | None = None
     if how[0] != "off":
         with suppress(InputError):  # such as an angle that this artery does not reach
-            yielded = straighten(other, [deployed], *how)
+            yielded = straighten(other, placed, *how)
             found |= {name: yielded.metrics()[name] for name in STRAIGHTENED}
     if flow is None or not other.aneurysms:
         return found
     inflow_mL_s = flow_case(anatomy, (), flow).inflow_mL_s * (1 + inflow_fraction)
     flow = replace(flow, inflow_mL_s=inflow_mL_s, inlet_speed_m_s=None)
-    bare, after = _flows(other, deployed.stent, flow)
+    bare, after = _flows(other, placed, flow)
     changes = ratios(bare, after)
     found |= {name: changes[name] for name in FLOW_RESULTS if name in changes}
     if yielded is not None:
-        for effect, one in zip(EFFECTS, _flows(yielded.anatomy, yielded.deployed[0].stent, flow), strict=True):
+        for effect, one in zip(EFFECTS, _flows(yielded.anatomy, yielded.deployed, flow), strict=True):
             changes = ratios(bare, one)
             found |= {f"{effect}{name}": changes[name] for name in OF_EFFECTS if name in changes}
     return found
 
 
-def _flows(anatomy: Anatomy, stent: Stent, flow: FlowSettings) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the indices of the flow without and with the device."""
-    shapes, bare = sac_surfaces(anatomy), simulate_case(flow_case(anatomy, (), flow))
-    after = simulate_case(flow_case(anatomy, (stent,), flow), start=bare)
-    return indices(bare, *shapes), indices(after, *shapes)
+def _found(anatomy: Anatomy, placed: Deployment) -> dict[str, float]:
+    """Return the measures of a deployment for which intervals are computed."""
+    measures, names = measure(anatomy, placed), COIL_RESULTS if isinstance(placed.stent, Coils) else RESULTS
+    return {name: float(measures[name]) for name in names if name in measures}
+
+
+def _flows(
+    anatomy: Anatomy, placed: Sequence[Deployment], flow: FlowSettings, bare: FlowField | None = None
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the indices of the flow without devices, which is computed where it is not given, and with them."""
+    shapes, stents = sac_surfaces(anatomy), [one.stent for one in placed]
+    bare = bare or simulate_case(flow_case(anatomy, (), flow))
+    after = indices(simulate_case(flow_case(anatomy, stents, flow), start=bare), *shapes)
+    density = sum(one.density_fraction for one in stents if isinstance(one, Coils))
+    after = after if flow.numerics.wires == "resolved" else between_coils(after, 1.0 - density)
+    return indices(bare, *shapes), after

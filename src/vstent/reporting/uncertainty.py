@@ -173,7 +173,8 @@ def uncertainty_of(metrics: Mapping[str, Any], titles: Mapping[str, str]) -> lis
             ranges.append("the numbers of the device within their ranges in the catalogue")
         if STIFFNESS in numbers:
             ranges.append(f"the {number_name(STIFFNESS)} within its range")
-        ranges = ranges or ["the seed, which places the catheter and turns the framing coil"]
+        if "packing_density_fraction" in study["intervals"]:
+            ranges.append("the seed, which places the catheter and turns the framing coil")
         failed = f", of which {study['failed_count']} did not fit the artery" if study["failed_count"] else ""
         words = f"{study['samples_count']} deployments{failed}. Varied: {', '.join(ranges)}."
         found.append(Varied(titles.get(name, name), words, intervals(treatment)))

@@ -90,6 +90,14 @@ def implant_keys(anatomy: Key, treatment: Treatment) -> dict[str, Key]:
     return keys
 
 
+def is_varied(treatment: Treatment) -> bool:
+    """Return whether an uncertainty study varies a treatment: one device, or coils kept in a sac by one stent."""
+    *others, last = treatment.implants or (None,)
+    return last is not None and (
+        not others or (len(others) == len(last.inside) == 1 and isinstance(find_design(last.device), Coil))
+    )
+
+
 def study_keys(source: str, settings: "Settings") -> dict[str, Key]:
     """Return the keys of all stages of a study of an input, with its SHA-256 `source`, by their name in the store.
 
@@ -113,10 +121,10 @@ def study_keys(source: str, settings: "Settings") -> dict[str, Key]:
     if settings.uncertainty is not None:
         flow, unused = (settings.flow, ()) if settings.uncertainty.flow_samples else (None, ("vstent.flow",))
         for treatment in settings.treatments:
-            if len(treatment.implants) == 1:
-                (key,), (device,) = deployed[treatment.name].values(), treatment.devices
-                numbers = settings.uncertainty.numbers_of(find_design(device))
-                varied = key, settings.uncertainty, numbers, flow, settings.straightening
+            if is_varied(treatment):
+                numbers = settings.uncertainty.numbers_of(find_design(treatment.devices[0]))
+                placed = [*deployed[treatment.name].values()]
+                varied = placed, settings.uncertainty, numbers, flow, settings.straightening
                 keys[f"vary {treatment.name}"] = key_of("vstent.plan.uncertainty", *varied, without=unused)
     return keys
 

@@ -48,7 +48,7 @@ from vstent.plan.bands import bands
 from vstent.plan.treatments import rank_treatments
 from vstent.plan.uncertainty import EFFECTS, Uncertainty, vary, vary_seeds
 from vstent.study.folder import flow_folder
-from vstent.study.keys import ALONE, ANATOMY, STRAIGHTENED, VESSEL, flow_stage, stage_name, yields
+from vstent.study.keys import ALONE, ANATOMY, STRAIGHTENED, VESSEL, flow_stage, is_varied, stage_name, yields
 from vstent.study.outputs import write_field
 from vstent.study.settings import Point, Settings
 from vstent.study.store import Key, Store
@@ -398,18 +398,19 @@ def plan_flows(anatomy: Anatomy, stents: Mapping[str, Sequence[Stent]], settings
 def vary_all(
     anatomy: Anatomy, implants: Implants, settings: Settings, store: Store, keys: Keys
 ) -> dict[str, dict[str, Any]]:
-    """Return the uncertainties of every treatment with one implant, by name."""
+    """Return the uncertainties of every treatment with one implant, or with coils inside one stent, by name."""
     if settings.uncertainty is None:
         return {}
     flow = settings.flow if settings.uncertainty.flow_samples else None
     spreads = {}
     for treatment in settings.treatments:
         stage, deployed = f"vary {treatment.name}", implants.get(treatment.name, {})
-        if len(deployed) > 1:
-            store.progress(stage, 1.0, "left out: only treatments of one implant are varied.")
-        if len(deployed) != 1:
+        if not deployed:
             continue
-        (deployment,) = deployed.values()
+        if not is_varied(treatment):
+            store.progress(stage, 1.0, "left out: only one device, alone or with coils, is varied.")
+            continue
+        deployment, *coils = deployed.values()
         if isinstance(deployment.stent.design, Basket):
             store.progress(stage, 1.0, "left out: baskets are not varied.")
             continue
@@ -425,9 +426,9 @@ def vary_all(
                 if isinstance(deployment.stent, Coils):
                     varied = vary_seeds(anatomy, deployment.stent, settings.uncertainty, **how)
                 else:
-                    anatomy = on_path(anatomy, deployment.stent.path)
+                    way, kept = on_path(anatomy, deployment.stent.path), [one.stent for one in coils]
                     varied = vary(
-                        anatomy, deployment, settings.uncertainty, straightening=settings.straightening, **how
+                        way, deployment, settings.uncertainty, kept, straightening=settings.straightening, **how
                     )
                 tell(f"{len(varied.points)} deployments; {varied.n_failed} of them did not fit.")
             store.save(stage, keys[stage], varied)
