@@ -125,7 +125,7 @@ def computed(judged: Judged, form: Format | None, *, shifted: bool) -> dict[str,
     state = judged.engine.init(judged.case, judged.start)
     density = 0.0
     if shifted:
-        density = float(snapshot(state).density[state.probe.cells].mean())
+        density = float(snapshot(state).density[state.sac_cells].mean())
     with stored(form, density):
         while len(state.history) < judged.checks:
             judged.engine.step(state)

@@ -139,7 +139,7 @@ def test_a_flow_that_swings_is_its_mean_once_that_is_known() -> None:
     known = next(k for k, one in enumerate(left) if one < state.case.numerics.tolerance)
     assert 24 <= known + 1 < 40
     field = engine.result(state, Outcome(True, tuple(left), 1.0, 1.0))
-    mean = mean_of(state.blocks, np.array(state.history), state.probe.cells)
+    mean = mean_of(state.blocks, np.array(state.history), state.sac_cells)
     assert mean.checks >= 40
     factor = np.mean(speeds[-mean.checks :])
     np.testing.assert_allclose(field.velocity_m_s, factor * still.velocity_m_s, atol=1e-6)
@@ -158,7 +158,7 @@ def test_what_goes_to_and_fro_is_told_by_its_size_and_not_by_its_mean() -> None:
         state.snapshots.append(now)
         state.blocks = with_check(state.blocks, now)
     field = engine.result(state, Outcome(False, (0.5,), 1.0, 1.0))
-    checks = mean_of(state.blocks, np.array(state.history), state.probe.cells).checks
+    checks = mean_of(state.blocks, np.array(state.history), state.sac_cells).checks
     size = np.abs(factors[-checks:]).mean()
     speed_m_s = np.linalg.norm(still.velocity_m_s, axis=1)
     assert np.linalg.norm(field.velocity_m_s, axis=1).max() < 1e-3 * speed_m_s.max()

@@ -253,7 +253,8 @@ def test_inflow_and_flow_are_varied_where_the_flow_is_asked(monkeypatch):
 def test_a_sample_whose_flow_is_done_is_not_computed_again(monkeypatch, tmp_path):
     asked = []
 
-    def ratios(_, inflow_mL_s):
+    def ratios(_, found):
+        inflow_mL_s = found["inlet_flow_mL_s"]
         asked.append(inflow_mL_s)
         if len(asked) == 3:
             raise KeyboardInterrupt
@@ -261,7 +262,7 @@ def test_a_sample_whose_flow_is_done_is_not_computed_again(monkeypatch, tmp_path
 
     monkeypatch.setattr(uncertainty, "ratios", ratios)
     monkeypatch.setattr(uncertainty, "simulate_case", lambda case, start=None: case)
-    monkeypatch.setattr(uncertainty, "indices", lambda case, *_: case.inflow_mL_s)
+    monkeypatch.setattr(uncertainty, "indices", lambda case, *_: {"inlet_flow_mL_s": case.inflow_mL_s})
     monkeypatch.setattr(uncertainty, "sac_surfaces", lambda *_: ())
     monkeypatch.setattr("vstent.flow.problem.ostium", lambda *_: None)
     ranges = Ranges(4, flow_samples=4, threshold_mm=0.0, landing_mm=0.5, device_mm=0.0)

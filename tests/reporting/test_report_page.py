@@ -150,7 +150,7 @@ def test_of_a_pulse_it_is_said_which_numbers_are_means(page):
                 "Blood is Newtonian",
                 "pressure at the outlets is assumed",
                 "porous screen",
-                "inflow is assumed: 0.27 m/s",
+                "inflow is assumed: mean inlet velocity 0.27 m/s",
             ),
             ("shear-thinning", "cubed"),
         ),

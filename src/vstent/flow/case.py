@@ -325,9 +325,9 @@ class FlowField:
     common_pressure_Pa: float = 0.0
     """Mean pressure that resistances at the outlets add to all pressures of this field; 0 without them."""
     neck_inflow_mL_s: float | None = None
-    """Neck inflow where it cannot be computed from this field: the time average of an unsteady flow, or the value
-    from an OpenFOAM mesh that is finer around the wires than this grid (0 where there is no neck). None: it is
-    computed from the field."""
+    """Neck inflow where it cannot be computed from this field: the time average of an unsteady flow, or the value from
+    cells that are finer around the wires than this grid (0 where there is no neck). None: it is computed from the
+    field."""
 
     def __post_init__(self) -> None:
         v = len(self.wall.vertices_mm)

@@ -14,7 +14,7 @@ from vstent.flow.lattice.gpu import require_gpu
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.levels import WIDTH, sizes_mm
 from vstent.flow.lattice.pace import longest_step_s, pace, peak_speed_m_s
-from vstent.flow.lattice.reading import field_of, joined, read, read_moving
+from vstent.flow.lattice.reading import field_of, joined, neck_mL_s, read, read_moving
 from vstent.flow.lattice.settling import CHECKS_APART, SHARE_OF_FIELD, Mean, field_left, mean_of, with_check
 from vstent.flow.lattice.setup import CELL_REYNOLDS, CELL_REYNOLDS_AT_END
 from vstent.flow.lattice.state import Snapshot, State
@@ -174,7 +174,8 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
             flow = joined(state, flows)
             moment = tuple(one.velocity_m_s for one in flows), tuple(one.pressure_Pa for one in flows)
             ends_mL_s = flow.inlets_mL_s, flow.outlets_mL_s
-            phases.append(Phase((k + 1) * state.check_s, *ends_mL_s, *moment, flow.wall_shear_stress_Pa))
+            at_neck_mL_s = neck_mL_s(state, k - len(state.snapshots))
+            phases.append(Phase((k + 1) * state.check_s, *ends_mL_s, *moment, flow.wall_shear_stress_Pa, at_neck_mL_s))
         changes = np.array([change for change in outcome.residual if np.isfinite(change)])
         advice = cycles_advice(changes, len(state.history) // PHASES, is_converged=outcome.is_converged)
         # For shear-thinning blood the wall shear stress of the mean flow differs from the mean wall shear stress.
@@ -186,7 +187,7 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
 
 def _left(state: State) -> float:
     """Return the estimated relative distance of the run from convergence."""
-    fields = [one.velocity[state.main.probe.cells] for one in state.main.snapshots]
+    fields = [one.velocity[state.main.sac_cells] for one in state.main.snapshots]
     links, enters = state.links, state.links.is_inflow
     wanted = (links.wanted * links.openings[:, d3q19.AREA])[enters]
     # Not zero while sound waves leave through the openings.
@@ -211,7 +212,7 @@ def _outflow_error(state: State) -> float:
 
 def _mean(state: State) -> Mean:
     """Return the best time average of the run so far."""
-    return mean_of(state.main.blocks, np.array(state.history), state.main.probe.cells)
+    return mean_of(state.main.blocks, np.array(state.history), state.main.sac_cells)
 
 
 def _of_mean(state: State, mean: Mean, *, is_converged: bool) -> tuple[float, str]:

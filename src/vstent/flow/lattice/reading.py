@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from vstent.deployment.struts import thickness_mm
 from vstent.flow import domain as domains
@@ -14,7 +13,7 @@ from vstent.flow.ends import outflows
 from vstent.flow.engines import Outcome
 from vstent.flow.lattice.levels import WIDTH
 from vstent.flow.lattice.setup import CELL_REYNOLDS
-from vstent.flow.lattice.state import NECK_INFLOW, Snapshot, State
+from vstent.flow.lattice.state import NECK_INFLOW, Snapshot, State, trusted
 from vstent.flow.wall_stress import mean_shear_Pa, wall_stress
 from vstent.kernels.arrays import Floats, Ints
 from vstent.kernels.directions import VELOCITIES
@@ -84,11 +83,7 @@ def joined(state: State, flows: Sequence[Reading]) -> Reading:
     """
     wall, result = state.case.vessel.lumen, flows[0]
     for coarse, fine, flow in zip(state.kept[:-1], state.kept[1:], flows[1:], strict=True):
-        assert coarse.interface is not None
-        grid = fine.domain
-        behind_mm = wall.vertices_mm - grid.cell_size_mm * wall.vertex_normals
-        distance_mm, nearest = cKDTree(grid.centers_mm).query(behind_mm)
-        is_fine = (distance_mm < 2 * grid.cell_size_mm) & coarse.interface.is_trusted[nearest]
+        is_fine = trusted(coarse, fine, wall.vertices_mm - fine.domain.cell_size_mm * wall.vertex_normals)
         for name in ("wall_shear_stress_Pa", "wall_pressure_Pa", "mean_shear_Pa"):
             values = getattr(flow, name)
             if values is not None:
@@ -139,8 +134,13 @@ def field_of(
         wire_force_N=None if domains.wires_of(state.case, finest.domain.cell_size_mm) is None else force_N(finest),
         mean_shear_Pa=flow.mean_shear_Pa,
         common_pressure_Pa=common_Pa,
-        neck_inflow_mL_s=flow.neck_inflow_mL_s,
+        neck_inflow_mL_s=neck_mL_s(state) if flow.neck_inflow_mL_s is None else flow.neck_inflow_mL_s,
     )
+
+
+def neck_mL_s(state: State, check: int = -1) -> float | None:
+    """Return the neck inflow at a check where levels that are not kept are finer there; else None."""
+    return None if state.levels == state.kept else float(state.history[check][NECK_INFLOW:].sum())
 
 
 def _remarks(state: State, levels: Sequence[Level], phases: Sequence[Phase]) -> str:

@@ -6,10 +6,12 @@ A *check* is a moment at which the monitored quantities are recorded and converg
 from collections import deque
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from vstent.flow import domain as domains
 from vstent.flow import sampling
@@ -19,7 +21,7 @@ from vstent.flow.lattice.levels import Interface
 from vstent.flow.lattice.scales import Scales
 from vstent.flow.lattice.screen import ScreenEntries
 from vstent.flow.lattice.setup import Addressing, Links, Refill
-from vstent.kernels.arrays import Floats, Ints
+from vstent.kernels.arrays import Bools, Floats, Ints
 
 DEFER_PAIRS = 8
 """Number of step pairs between updates of the deferred wall correction and mass balance."""
@@ -30,18 +32,8 @@ TOO_FAST = 0.75
 flow."""
 NECK_INFLOW = 3
 """Column of the neck inflow among the monitored quantities, where there is a neck."""
-
-
-@dataclass(frozen=True, eq=False)
-class Probe:
-    """Places where the monitored quantities are evaluated."""
-
-    cells: Ints
-    """Cells of the sac, or of the whole lumen where there is no sac."""
-    ostium_points: Floats
-    """(p, 3) points on the ostium, in grid units."""
-    ostium_area_mm2: Floats
-    """(p, 3) area vectors at these points."""
+BESIDE_CELLS = 3.5
+"""Distance, in cells of a level, to its nearest cell within which a point counts as in it: half a wire, diagonally."""
 
 
 def speeds(velocity: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -182,12 +174,21 @@ class State:
         return self.kept[-1]
 
     @cached_property
-    def probe(self) -> Probe:
-        """Places of the monitored quantities."""
-        points_mm, area_mm2 = np.zeros((0, 3)), np.zeros((0, 3))
-        if self.case.ostium is not None:
-            points_mm, area_mm2 = sampling.surface_samples(self.case.ostium, self.domain.cell_size_mm)
-        return Probe(domains.cells_of_sac(self.case, self.domain), self.domain.places(points_mm), area_mm2)
+    def sac_cells(self) -> Ints:
+        """Cells of the sac, or of the whole lumen where there is no sac."""
+        return domains.cells_of_sac(self.case, self.domain)
+
+    @cached_property
+    def neck(self) -> tuple[tuple[Floats, Floats], ...]:
+        """Points (p, 3) on the ostium that are read on each level, in its grid units, and their area vectors (p, 3)."""
+        if self.case.ostium is None:
+            return ()
+        points_mm, area_mm2 = sampling.surface_samples(self.case.ostium, self.levels[-1].domain.cell_size_mm)
+        number = np.zeros(len(points_mm), dtype=int)
+        for depth, (coarse, fine) in enumerate(pairwise(self.levels), start=1):
+            number[trusted(coarse, fine, points_mm)] = depth
+        parts = [(level.domain, number == depth) for depth, level in enumerate(self.levels)]
+        return tuple((grid.places(points_mm[chosen]), area_mm2[chosen]) for grid, chosen in parts)
 
     @property
     def steps_per_check(self) -> int:
@@ -198,3 +199,10 @@ class State:
     def time_s(self) -> float:
         """Return the flow time since the start of the run."""
         return self.check_s * (len(self.history) + self.since_check / self.steps_per_check)
+
+
+def trusted(coarse: State, fine: State, points_mm: Floats) -> Bools:
+    """Return whether points (m, 3) lie inside the border of a level, in its blood or in a wire beside it."""
+    assert coarse.interface is not None
+    distance_mm, nearest = cKDTree(fine.domain.centers_mm).query(points_mm)
+    return (distance_mm < BESIDE_CELLS * fine.domain.cell_size_mm) & coarse.interface.is_trusted[nearest]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from vstent.flow import domain as domains
 from vstent.flow import sampling
-from vstent.flow.case import FlowCase, FlowField
+from vstent.flow.case import Cells, FlowCase, FlowField
 from vstent.flow.ends import outflows
 from vstent.flow.lattice.gpu import require_gpu, told
 from vstent.flow.lattice.kernels import d3q19, exchange
@@ -203,7 +203,7 @@ def step(state: State) -> None:
     if state.since_check == state.steps_per_check:
         with np.errstate(over="ignore", invalid="ignore"):  # divergence is reported as an error, not as a warning
             now = snapshots(state)
-            for level, of_level in zip(state.kept, now, strict=True):
+            for level, of_level in zip(state.kept, now, strict=False):
                 level.snapshots.append(of_level)
             state.history.append(np.zeros(0))
             state.since_check = 0
@@ -438,7 +438,7 @@ def _settle(state: State, part: float) -> None:
 
 
 def snapshots(state: State) -> list[Snapshot]:
-    """Return the present flow on all levels that are kept; a cell that has finer ones has their mean."""
+    """Return the present flow on all levels; a cell that has finer ones has their mean."""
     now = [snapshot(level) for level in state.levels]
     for coarse, level, fine in reversed(list(zip(now[:-1], state.levels[:-1], now[1:], strict=True))):
         assert level.interface is not None
@@ -451,7 +451,7 @@ def snapshots(state: State) -> list[Snapshot]:
         ):
             for column, of_column in zip(values.T, of_finer.T, strict=True):
                 column[covered] = np.bincount(cell, of_column[finer], len(count))[covered] / most
-    return now[: len(state.kept)]
+    return now
 
 
 def snapshot(state: State) -> Snapshot:
@@ -482,14 +482,18 @@ def _read_here(state: State) -> tuple[NDArray[np.float32], NDArray[np.float32], 
 def monitored(state: State, now: Sequence[Snapshot]) -> Floats:
     """Return the monitored quantities: mean speed in the sac, inlet pressure, mean speed in the vessel, neck inflow.
 
-    `now` is the flow on every level that is kept; sac and neck are read on the finest of them.
+    `now` is the flow on every level. The sac is read on the finest one kept, a point of the neck on the finest there.
     """
     first_inflow = state.links.patch[np.argmax(state.links.is_inflow)]
     inlet = state.domain.link_cell[state.domain.link_patch == first_inflow]
-    velocity_m_s, grid, probe = now[-1].velocity_m_s, state.main.domain, state.main.probe
-    values = [speeds(velocity_m_s[probe.cells]).mean(), now[0].pressure_Pa[inlet].mean(), now[0].speed_m_s.mean()]
-    if len(probe.ostium_points):
-        at, area_mm2 = probe.ostium_points, probe.ostium_area_mm2
-        through_mL_s = sampling.read_through_mL_s(grid, velocity_m_s.astype(float), at, area_mm2)
-        values.append(sampling.inflow_mL_s(through_mL_s))
+    in_sac = speeds(now[len(state.kept) - 1].velocity_m_s[state.main.sac_cells])
+    values = [in_sac.mean(), now[0].pressure_Pa[inlet].mean(), now[0].speed_m_s.mean()]
+    if state.neck:
+        parts = zip(state.levels, now, state.neck, strict=True)
+        values.append(sum(_inflow_mL_s(level.domain, one.velocity_m_s, *at) for level, one, at in parts))
     return np.array(values, dtype=float)
+
+
+def _inflow_mL_s(grid: Cells, velocity_m_s: NDArray[np.float32], places: Floats, area_mm2: Floats) -> float:
+    """Return the flow rate in through points (p, 3) on a level, in its grid units."""
+    return sampling.inflow_mL_s(sampling.read_through_mL_s(grid, velocity_m_s.astype(float), places, area_mm2))
