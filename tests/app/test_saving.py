@@ -21,8 +21,14 @@ WIDTH_PX = round(WIDTH_MM / 25.4 * DPI)
 
 def saved(page, name, kind):
     """Bytes of a view as the page saves it, 90 mm wide at 150 dpi."""
-    page.locator(f".save[aria-label$=': {name}']").click()
-    form = page.locator(".save-form")
+    form, button = page.locator(".save-form"), page.locator(f".save[aria-label$=': {name}']")
+
+    def is_asked():  # a panel that is drawn anew between press and release takes the click away
+        if not form.is_visible():
+            button.click()
+        return form.is_visible()
+
+    assert in_time(page, is_asked)
     form.locator("[data-key=format]").select_option(kind)
     form.locator("[data-key=dpi]").select_option(str(DPI))
     form.locator("input").fill(str(WIDTH_MM))
