@@ -380,9 +380,9 @@ def _links(
     fraction = np.clip(np.where(is_missed, 0.5, fraction), 1e-3, 1.0)
     _, _, face = surface.closest(starts + fraction[:, None] * step_mm)
     patch = np.where(is_missed | is_wire, WALL, face_patch[face])
-    links = cell.astype(np.int32), direction.astype(np.int32), fraction, patch.astype(np.int32), is_wire
     ends = ~(is_missed & is_beyond[ahead])
-    return links[0][ends], links[1][ends], links[2][ends], links[3][ends], links[4][ends]
+    cell, direction, patch = (one[ends].astype(np.int32) for one in (cell, direction, patch))
+    return cell, direction, fraction[ends], patch, is_wire[ends]
 
 
 def septa(surface: Surface, neighbour: Ints, grid: Cells, *, of_wires: bool = False) -> tuple[Ints, Ints]:

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 TO_EITHER_SIDE: Final = Limits("mm", 0.0)
 """Limits of a range, which goes to either side."""
+STIFFNESS: Final = "stiffness_to_wall"
+"""Name of the stiffness of the device relative to wall and bed, which varies where the artery yields."""
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from vstent.flow.settings import FlowSettings
 from vstent.flow.simulation import Checkpoint, simulate_case
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Floats, freeze
-from vstent.plan.ranges import Ranges
+from vstent.plan.ranges import STIFFNESS, Ranges
 from vstent.plan.shares import centered_points, first_order_shares
 from vstent.plan.widening import widened
 
@@ -63,8 +63,6 @@ OF_EFFECTS: Final = ("neck_inflow_mL_s_ratio", "mean_sac_velocity_m_s_ratio")
 """Flow ratios that are computed in the artery that has yielded, relative to the artery as scanned without a device."""
 EFFECTS: Final = "straightened_bare_", "straightened_"
 """What the names of these begin with: without and with the device."""
-STIFFNESS: Final = "stiffness_to_wall"
-"""Name of the stiffness of the device relative to wall and bed."""
 WIDEST_FRACTION: Final = 0.1
 """Fraction of the free diameter below which the range of the device's diameter must be."""
 INTERVAL: Final = (0.025, 0.975)

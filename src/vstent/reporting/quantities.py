@@ -143,7 +143,7 @@ def base_of(key: str) -> tuple[str, str]:
     if key in DEFINITIONS:
         return key, ""
     for before, what in YIELDED.items():
-        if key.startswith(before) and key not in DEFINITIONS:
+        if key.startswith(before):
             base, more = base_of(key.removeprefix(before))
             return base, f"{more}, {what}"
     if key.endswith(RATIO):

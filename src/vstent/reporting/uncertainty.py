@@ -4,6 +4,7 @@ import re
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
+from vstent.plan.ranges import STIFFNESS
 from vstent.reporting.quantities import Quantity, format_value
 
 NUMBERS: Final = {
@@ -16,7 +17,7 @@ NUMBERS: Final = {
     "cell_angle_rad": "cell angle",
     "free_diameter_margin_mm": "free diameter",
     "label_length_mm": "length at the label diameter",
-    "stiffness_to_wall": "stiffness of the device relative to wall and bed",
+    STIFFNESS: "stiffness of the device relative to wall and bed",
 }
 """Display names of the numbers of the catalogue."""
 HEADLINES: Final = ("deployed_length_mm", "neck_metal_coverage_fraction")
@@ -30,10 +31,6 @@ CAUSES: Final = {
     "rest": "interplay and chance",
 }
 """Display names of the causes of uncertainty."""
-
-
-STIFFNESS: Final = "stiffness_to_wall"
-"""Name of the number that is varied where the artery yields."""
 
 
 class Row(NamedTuple):
