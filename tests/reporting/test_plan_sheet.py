@@ -115,7 +115,7 @@ def test_alternatives_are_the_best_neighbours(planned) -> None:
     assert len(found) == 2
     for one in found:
         assert one.size != stent.size
-        assert one.size.label in text
+        assert one.size.label.replace("x", "×") in text
     scores = {(one.size.diameter_mm, one.size.length_mm): one.score for one in rank(anatomy(), [design]).candidates}
     near = [
         size

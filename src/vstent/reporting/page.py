@@ -333,7 +333,7 @@ def _plain(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return f"{value:.4g}"
+        return np.format_float_positional(value, 4, fractional=False, trim="-")
     if isinstance(value, str) and re.fullmatch(r"[a-z]+(_[a-z]+)+", value):
         return value.replace("_", " ")
     if isinstance(value, (list, tuple)):

@@ -1,12 +1,13 @@
 """Report as PDF on A4 pages: the answer, then flow, anatomy and devices, then an appendix on how they were found."""
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import Any, Final
 
 from vstent.flow.grade import GOOD
 from vstent.reporting.definitions import OF_PULSE
 from vstent.reporting.page import Contents
-from vstent.reporting.paper import ACCENT, PAGE_IN, QUIET, Paper
+from vstent.reporting.paper import ACCENT, PAGE_IN, QUIET, Paper, scale_of
 from vstent.reporting.quantities import Change, Quantity, format_change
 from vstent.reporting.ranked import treatment_rows
 from vstent.reporting.uncertainty import between, ends
@@ -32,9 +33,10 @@ def as_pdf(told: Contents) -> bytes:
     from matplotlib import rc_context
 
     with rc_context({"pdf.fonttype": 42, "font.family": "DejaVu Sans"}):
-        paper = Paper(told.name)
-        _answer(paper, told)
-        paper.turn()
+        answer = partial(_answer, told=told)
+        paper = Paper(told.name, scale=scale_of(answer))
+        answer(paper)
+        paper.turn(1.0)
         _flow(paper, told)
         paper.heading("Anatomy")
         _pictures(paper, told, "Anatomy")
@@ -129,11 +131,11 @@ def _appendix(paper: Paper, told: Contents) -> None:
             paper.table(implant["facts"], (0.26, 0.74))
         if causes := [(row.name, row.cause) for row in implant["bands"] if row.cause]:
             paper.text("Largest cause of each band (95 %):", 8, color=QUIET)
-            _pairs(paper, causes)
+            paper.table(causes, (0.5, 0.5))
     paper.heading("Appendix: settings and versions")
     for title, lines in told.provenance:
         paper.text(title, color=ACCENT)
-        _pairs(paper, [line for line in lines if line[1] != "–"])
+        _pairs(paper, [line for line in lines if line[1] not in ("–", "")])
 
 
 def _pictures(paper: Paper, told: Contents, section: str) -> None:
