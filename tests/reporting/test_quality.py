@@ -76,7 +76,7 @@ def test_grade_and_grid_stand_below_the_first_numbers_of_the_report_and_say_what
     assert "fair (9 cells across the neck)" in before
     assert "not usable (9 cells across the neck)" in before
     assert "grid spacing 0.400 mm, 19,152 cells, 4,000 time steps, inflow 3.74 mL/s (224 mL/min), assumed" in before
-    assert "(Reynolds number 297), mass residual 0.04\u202f%" in before
+    assert "(Reynolds number 297), mass residual 0.04 %" in before
 
 
 def test_a_case_without_grades_has_none() -> None:

@@ -404,9 +404,7 @@ def _titles(metrics: dict[str, Any], case: Case) -> dict[str, str]:
     """Return the titles of the treatments, devices with their sizes, in the order in which they were chosen."""
     chosen = {one.name: [implant.id for implant in one.implants] for one in case.state.choices.treatments}
     titles = {}
-    for name in sorted(metrics["treatments"], key=lambda name: [*chosen, name].index(name)):
-        if name == BARE:
-            continue
+    for name in sorted(sorted(metrics["treatments"].keys() - {BARE}), key=lambda name: [*chosen, name].index(name)):
         implants = metrics["treatments"][name]["implants"]
         ordered = sorted(implants, key=lambda key: [*chosen.get(name, ()), key].index(key))
         titles[name] = " + ".join(f"{implants[key]['device']} {implants[key]['size']}" for key in ordered)

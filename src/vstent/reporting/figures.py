@@ -262,15 +262,16 @@ def _contours(scene: Scene, meshes: Sequence[tuple[str, str]]) -> Plate:
     """Return the picture of the deployed contours in these panes, colored by their gap to the wall."""
     shots = []
     for pane, title in meshes:
-        contour = next(layer for layer in scene.pick(("contour",), pane) if isinstance(layer, MeshLayer))
+        contours = [layer for layer in scene.pick(("contour",), pane) if isinstance(layer, MeshLayer)]
+        contour = max(contours, key=lambda one: float(one.values.max()))
         largest_mm = float(contour.values.max())
         profile, is_seen = scene.view("profile"), largest_mm >= SEEN_GAP_MM
-        words = f"gap up to {largest_mm:.2f} mm, over the neck too" if is_seen else f"gaps below {SEEN_GAP_MM:g} mm"
+        words = f"gap up to {largest_mm:.2f} mm" if is_seen else f"gaps below {SEEN_GAP_MM:g} mm"
         view = gap_view(contour, profile) if is_seen else profile
         shots.append(Shot(f"{title}: {words}", scene.pick(("lumen", "continued", "contour", "neck"), pane), view))
     caption = (
-        "The deployed contour in the lumen, colored by its gap to the wall of the parent artery and seen from the side "
-        "where the gap is largest."
+        "The deployed contour in the lumen, colored by its gap to the wall of the parent artery, over the neck too, "
+        "and seen from the side where the gap is largest."
     )
     return Plate("contour", "Position of the devices", caption, scene, shots, "wall_gap")
 

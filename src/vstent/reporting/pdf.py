@@ -40,7 +40,7 @@ def as_pdf(told: Contents) -> bytes:
         _flow(paper, told)
         paper.heading("Anatomy")
         _pictures(paper, told, "Anatomy")
-        _pairs(paper, _rows(told.vessel, 1))
+        _pairs(paper, [(_named(quantity, 1), quantity.text) for quantity in told.vessel])
         paper.heading("Openings")
         paper.table(told.openings, (0.25, 0.2, 0.2, 0.35), head=("Opening", "Diameter", "Area", "Center (LPS)"))
         _devices(paper, told)
@@ -48,7 +48,8 @@ def as_pdf(told: Contents) -> bytes:
             paper.heading(f"Uncertainty: {varied.title}")
             paper.text(varied.words)
             head = ("Result", "Mean", "95 % lie between", "Share of each cause")
-            rows = [(row.name, row.mean, row.band, _shares(row.shares)) for row in varied.rows]
+            causes = [", ".join(f"{cause} {100 * share:.0f} %" for cause, share in row.shares) for row in varied.rows]
+            rows = [(row.name, row.mean, row.band, cause) for row, cause in zip(varied.rows, causes, strict=True)]
             paper.table(rows, (0.27, 0.13, 0.24, 0.36), head=head)
         paper.heading("Notes and limits")
         for note in (*told.notes, *told.limits):
@@ -152,16 +153,6 @@ def _pairs(paper: Paper, rows: Sequence[tuple[str, str]]) -> None:
     paper.table(
         [(*one, *other) for one, other in zip(rows[:half], beside, strict=True)], (0.3, 0.18, 0.34, 0.18), names=(0, 2)
     )
-
-
-def _shares(shares: Iterable[tuple[str, float]]) -> str:
-    """Return causes with their shares of the variance."""
-    return ", ".join(f"{cause} {100 * share:.0f} %" for cause, share in shares)
-
-
-def _rows(quantities: Iterable[Quantity], skip: int) -> list[tuple[str, str]]:
-    """Return name and value of quantities; the first `skip` keys of their paths are left out of the names."""
-    return [(_named(quantity, skip), quantity.text) for quantity in quantities]
 
 
 def _named(quantity: Quantity, skip: int) -> str:

@@ -22,6 +22,7 @@ from vstent.reporting.paper import QUIET, Paper, scale_of
 from vstent.reporting.quantities import format_value
 from vstent.reporting.scene import Implants, scene_of, titled
 from vstent.reporting.uncertainty import ends, how_sure
+from vstent.units import counted
 
 PICTURE_SHARE: Final = 0.19
 """Largest height of the picture as a fraction of the page."""
@@ -98,7 +99,7 @@ def _write(
     for sentence in warnings[: 1 + MOST_NOTES]:
         paper.text(f"– {sentence}", 8)
     if len(warnings) > 1 + MOST_NOTES:
-        paper.text(f"{len(warnings) - 1 - MOST_NOTES} more notes are in the report.", 8, color=QUIET)
+        paper.text(f"{counted(len(warnings) - 1 - MOST_NOTES, 'more note')} in the report.", 8, color=QUIET)
     paper.heading("This size and alternatives")
     paper.table(others, (0.20, 0.13, 0.67), head=("Size", "Score of 100", "Reason"))
     paper.text("Blood flow is not part of this plan. Name, date, signature: ______________________________", 8.5)

@@ -234,13 +234,8 @@ def titled(implants: Implants) -> list[tuple[str, str, str, Deployment]]:
     return [
         (name, key, title, deployed[key])
         for name, deployed in implants.items()
-        for key, title in implant_titles(deployed, f"{devices_of(deployed)}: " if len(implants) > 1 else "").items()
+        for key, title in implant_titles(deployed, f"{treatment_title(deployed)}: " * (len(implants) > 1)).items()
     ]
-
-
-def devices_of(deployed: Mapping[str, Deployment]) -> str:
-    """Return the devices of a treatment: ``Silk + Silk``."""
-    return " + ".join(one.stent.design.name for one in deployed.values())
 
 
 def treatment_title(deployed: Mapping[str, Deployment]) -> str:
