@@ -163,7 +163,7 @@ export function pulseChart({ time_s, factor }, isPulsatile, times, moment, chose
   const y = (f) => height - bottom - ((height - top - bottom) * f) / high;
   const parts = [0, 1].flatMap((v) => level(y(v), left, width - 8, String(v), v ? "goal" : "grid"));
   const shown = moment !== undefined && times.length ? `shown: ${times[moment].toFixed(2)} s` : times.length ? "shown: the cycle's mean" : isPulsatile ? "pulsatile" : "steady, at the mean";
-  parts.push(text(0, 12, "Inflow / mean", { class: "axis-title" }), text(width - 34, 13, shown, { class: "axis-title end" }));
+  parts.push(text(0, 12, "Inflow / mean", { class: "axis-title" }), text(width - 42, 12, shown, { class: "axis-title end" }));
   for (const t of ticks(0, time_s.at(-1), 4)) parts.push(text(x(t), height - 8, `${t} s`, { class: "tick middle" }));
   parts.push(svg("path", { d: path(time_s.map((t, i) => [x(t), y(factor[i])])), class: isPulsatile ? "line device" : "line artery" }));
   const at = (t) => factor[Math.round((t / time_s.at(-1)) * (factor.length - 1))];
