@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from rich.console import Console as RichConsole
 from rich.status import Status
-from rich.table import Table
+from rich.table import Column, Table
 
 from vstent.devices.design import Design
 from vstent.devices.fit import Fitted
@@ -21,7 +21,7 @@ from vstent.geometry.vessel import Opening
 from vstent.plan.rank import Candidate, Ranking
 from vstent.reporting.definitions import INDICES_WITH_OCCLUSION
 from vstent.reporting.quality import qualities
-from vstent.reporting.quantities import ERRORS, flatten, format_change, format_value, opening_rows
+from vstent.reporting.quantities import ERRORS, flatten, format_change, format_value, opening_rows, spoken
 from vstent.reporting.ranked import treatment_rows
 from vstent.reporting.uncertainty import ends, how_sure, intervals, number_name
 from vstent.study.followup import Followup
@@ -126,14 +126,14 @@ def _state(told: Progress) -> str:
         parts.append(f"{told.residual:.1%} from convergence")
     if told.seconds_left is not None:
         left_s = told.seconds_left
-        parts.append(f"{left_s:.0f} s left" if left_s < 90 else f"about {left_s / 60:.0f} min left")
+        parts.append(f"{max(left_s, 1):.0f} s left" if left_s < 90 else f"about {left_s / 60:.0f} min left")
     return ", ".join(part for part in parts if part)
 
 
 def comparison_table(metrics: Mapping[str, Any]) -> Table:
     """Return the table of the main results: in the bare artery, and with each treatment and its relative change."""
     treatments, bare = _treatments(metrics), _bare(metrics)
-    table = Table("", BARE, *treatments)
+    table = _table("", "no device", *treatments)
     for title, key in DEVICE_ROWS:
         cells = [
             " + ".join(
@@ -152,6 +152,11 @@ def comparison_table(metrics: Mapping[str, Any]) -> Table:
         table.add_section()
         _add_flow_rows(table, metrics, {key: title for title, key in ROWS})
     return table
+
+
+def _table(title: str, *treatments: str) -> Table:
+    """Return an empty table with a column for every treatment; however narrow it is, no name is cut."""
+    return Table(title, *(Column(name, overflow="fold") for name in treatments))
 
 
 def _treatments(metrics: Mapping[str, Any]) -> dict[str, Any]:
@@ -203,7 +208,7 @@ def _add_flow_rows(table: Table, metrics: Mapping[str, Any], titles: Mapping[str
             table.add_row(title, _cell(key, bare[key]), *shown)
 
 
-COHORT_COLUMNS: Final = (
+COHORT_ROWS: Final = (
     ("length, mm", "implant.deployed_length_mm", "{:.1f}"),
     ("apposed", "implant.apposed_fraction", "{:.0%}"),
     ("metal at neck", "implant.neck_metal_coverage_fraction", "{:.0%}"),
@@ -212,7 +217,7 @@ COHORT_COLUMNS: Final = (
     ("CPU s a case", "case_cpu_s", "{:.1f}"),
     ("MB", "peak_memory_MB", "{:.0f}"),
 )
-"""Columns of the cohort table: title, key and number format."""
+"""Rows of the cohort table: title, key and number format."""
 RANKING_COLUMNS: Final = (
     ("mm long", "deployed_length_mm", "{:.1f}"),
     ("apposed", "apposed_fraction", "{:.0%}"),
@@ -239,7 +244,7 @@ def ranking_table(ranking: Ranking, shown: int) -> Table:
     table = Table("", "device and size, mm", *shift, "score", *(title for title, _, _ in columns))
     for number, candidate in _shown(ranking, shown):
         measures = candidate.measures
-        cells = ["" if measures.get(key) is None else form.format(measures[key]) for _, key, form in columns]
+        cells = ["" if measures.get(key) is None else _typed(form, measures[key]) for _, key, form in columns]
         if "deployed_length_low_mm" in measures:
             cells[0] += f" ({measures['deployed_length_low_mm']:.1f}-{measures['deployed_length_high_mm']:.1f})"
         label = f"{candidate.label.removesuffix(' mm')}{' *' if candidate.is_proposed else ''}"
@@ -261,10 +266,11 @@ def ranking_table(ranking: Ranking, shown: int) -> Table:
 def treatments_table(ranked: Sequence[Mapping[str, Any]]) -> Table:
     """Return the table of ranked treatments."""
     head, rows = treatment_rows(ranked)
-    table = Table(*head)
-    for row in rows:
-        table.add_row(*row)
-    table.caption = "Scores of 100; with jailed branches: the change of their flow."
+    (_, *names), *measures = list(zip(head, *rows, strict=True))[1:]
+    table = _table("treatment", *names)
+    for cells in measures:
+        table.add_row(*map(_spaced, cells))
+    table.caption = "The best first; scores of 100. With jailed branches: the change of their flow."
     return table
 
 
@@ -288,18 +294,17 @@ def _shown(ranking: Ranking, count: int) -> list[tuple[int, Candidate]]:
 
 
 def cohort_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Return the table of a cohort: one row per treatment with medians over the finished cases."""
-    columns = [column for column in COHORT_COLUMNS if any(row.get(column[1]) is not None for row in rows)]
-    table = Table("treatment", "done", "failed", "lost", *(title for title, _, _ in columns))
-    for treatment in dict.fromkeys(row["treatment"] for row in rows):
-        own = [row for row in rows if row["treatment"] == treatment]
-        counts = [str(sum(row["outcome"] == outcome for row in own)) for outcome in ("done", "failed", "lost")]
-        found = [[row[key] for row in own if row.get(key) is not None] for _, key, _ in columns]
-        cells = [
-            form.format(median(values)) if values else "" for values, (*_, form) in zip(found, columns, strict=True)
-        ]
-        table.add_row(treatment, *counts, *cells)
-    table.caption = "medians"
+    """Return the table of a cohort: one column per treatment with medians over the finished cases."""
+    names = dict.fromkeys(row["treatment"] for row in rows)
+    own = [[row for row in rows if row["treatment"] == name] for name in names]
+    table = _table("treatment", *names)
+    for outcome in ("done", "failed", "lost"):
+        table.add_row(outcome, *(str(sum(row["outcome"] == outcome for row in some)) for some in own))
+    for title, key, form in COHORT_ROWS:
+        found = [[row[key] for row in some if row.get(key) is not None] for some in own]
+        if any(found):
+            table.add_row(title, *(_typed(form, median(values)) if values else "" for values in found))
+    table.caption = "Medians of the finished cases."
     return table
 
 
@@ -331,14 +336,14 @@ def morphology_table(measures: Mapping[str, Any]) -> Table:
 
 def flow_table(metrics: Mapping[str, Any]) -> Table:
     """Return the table of all flow indices: bare, and with each treatment and its relative change."""
-    table = Table("flow", BARE, *_treatments(metrics))
+    table = _table("flow", "no device", *_treatments(metrics))
     _add_flow_rows(table, metrics, {quantity.key: quantity.name for quantity in flatten(_bare(metrics))})
     return table
 
 
 def angiogram_table(metrics: Mapping[str, Any]) -> Table:
     """Return the table of angiograms: bare, and with each treatment and its relative change."""
-    table = Table("angiogram", BARE, *_treatments(metrics))
+    table = _table("angiogram", "no device", *_treatments(metrics))
     _add_flow_rows(table, metrics, {key: _title(key) for key in CONTRAST_ROWS})
     table.caption = "\n".join([str(table.caption or ""), *INDICES_WITH_OCCLUSION]).strip()
     return table
@@ -382,6 +387,11 @@ def _cell(key: str, value: Any) -> str:
     return "" if value is None else _spaced(format_value(key, value))
 
 
+def _typed(form: str, value: Any) -> str:
+    """Return a value in a number format, with signs of typography."""
+    return _spaced(spoken(form.format(value)))
+
+
 def _spaced(text: str) -> str:
     """Return text with plain spaces instead of narrow ones, which some terminals lack."""
     return text.replace("\u202f", " ")
@@ -391,7 +401,7 @@ def _change(key: str, bare: float, value: float | None) -> str:
     """Return a value with its unit and its change; empty where there is none."""
     if value is None or key in ERRORS:
         return _cell(key, value)
-    change = _spaced(format_change(bare, value, key)).replace(" %", "%").replace("−", "-")
+    change = _spaced(format_change(bare, value, key))
     return f"{_cell(key, value)} ({change})" if change != "–" else _cell(key, value)
 
 
@@ -409,7 +419,7 @@ def device_table(devices: Mapping[str, Design]) -> Table:
     table = Table()
     # A name is typed as it stands: it is never cut, however narrow the terminal.
     table.add_column("name", no_wrap=True, min_width=max(map(len, devices), default=0))
-    for title in ("device", "construction", "sizes (diameter x length, mm)", "numbers with a cited source"):
+    for title in ("device", "construction", "sizes, mm", "numbers with a cited source"):
         table.add_column(title, overflow="fold")
     for name, design in devices.items():
         cited = sum(fact.confidence == "cited" for fact in design.facts)
