@@ -26,6 +26,7 @@ from vstent.reporting.ranked import treatment_rows
 from vstent.reporting.uncertainty import ends, how_sure, intervals, number_name
 from vstent.study.followup import Followup
 from vstent.study.progress import Progress
+from vstent.units import counted
 
 ROWS: Final = (
     ("Neck inflow", "neck_inflow_mL_s"),
@@ -170,20 +171,14 @@ def _bare(metrics: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def device_sentences(metrics: Mapping[str, Any]) -> list[str]:
-    """Return how sure each device is, one text each, with the ranges of all its implants."""
-    by_device: dict[str, dict[str, Any]] = {}
+    """Return how sure each device is, one text each; the ranges are those of its first implant."""
+    first: dict[str, tuple[Any, str]] = {}
     for name, treatment in _treatments(metrics).items():
         for key, implant in treatment["implants"].items():
             if implant.get("bands"):
-                title = name if len(treatment["implants"]) == 1 else f"{key} of {name}"
-                by_device.setdefault(implant["bands"]["device"], {})[title] = implant
-    sentences = []
-    for implants in by_device.values():
-        titles = implants if len(implants) > 1 else [""]
-        parts = zip(implants.values(), titles, strict=True)
-        told = (how_sure(implant, title, is_repeated=n > 0) for n, (implant, title) in enumerate(parts))
-        sentences.append(_spaced(" ".join(told)))
-    return sentences
+                title = name if key == name else f"{key} of {name}"
+                first.setdefault(implant["bands"]["device"], (implant, title))
+    return [_spaced(how_sure(*one)) for one in first.values()]
 
 
 def _add_flow_rows(table: Table, metrics: Mapping[str, Any], titles: Mapping[str, str]) -> None:
@@ -269,7 +264,8 @@ def treatments_table(ranked: Sequence[Mapping[str, Any]]) -> Table:
     (_, *names), *measures = list(zip(head, *rows, strict=True))[1:]
     table = _table("treatment", *names)
     for cells in measures:
-        table.add_row(*map(_spaced, cells))
+        if any(cells[1:]):
+            table.add_row(*map(_spaced, cells))
     table.caption = "The best first; scores of 100. With jailed branches: the change of their flow."
     return table
 
@@ -428,7 +424,7 @@ def device_table(devices: Mapping[str, Design]) -> Table:
         spans = (
             " to ".join(dict.fromkeys(f"{mm:g}" for mm in (all_mm[0], all_mm[-1]))) for all_mm in (diameters, lengths)
         )
-        sizes = f"{' x '.join(spans)} ({len(design.sizes)} sizes)"
+        sizes = f"{' x '.join(spans)} ({counted(len(design.sizes), 'size')})"
         table.add_row(name, design.name, design.kind.replace("_", "-"), sizes, f"{cited} of {len(design.facts)}")
     return table
 
@@ -440,7 +436,7 @@ def fit_table(fitted: Fitted) -> Table:
         fitted.names, fitted.values, fitted.errors, fitted.prior_errors, fitted.is_determined, strict=True
     ):
         is_angle = name.endswith("_rad")
-        unit = "°" if is_angle else "um" if name.endswith("_um") else "mm"
+        unit = "°" if is_angle else "µm" if name.endswith("_um") else "mm"
         cells = (f"{degrees(x):.2f} {unit}" if is_angle else f"{x:.3f} {unit}" for x in (value, error, before))
         table.add_row(_number_title(name), *cells, "yes" if is_determined else "no, as the similar device")
     residuals = fitted.residuals
@@ -457,7 +453,7 @@ def correlation_table(fitted: Fitted) -> Table:
     """Return the table of correlations of the fitted numbers."""
     table = Table("correlation", *(str(k) for k in range(1, len(fitted.names) + 1)))
     for k, (name, row) in enumerate(zip(fitted.names, fitted.correlation, strict=True), start=1):
-        table.add_row(f"{k} {_number_title(name)}", *(f"{value:+.2f}" for value in row))
+        table.add_row(f"{k} {_number_title(name)}", *(_typed("{:+.2f}", value) for value in row))
     return table
 
 
