@@ -1,10 +1,21 @@
 """What the terminal's tables say: every value with the unit and the digits of the report."""
 
+from types import SimpleNamespace
+
 import pytest
+from rich.console import Console
 from rich.table import Table
 
 from vstent.cli import main
-from vstent.cli.console import _state, comparison_table, flow_table, opening_table
+from vstent.cli.console import (
+    _state,
+    cohort_table,
+    comparison_table,
+    flow_table,
+    opening_table,
+    ranking_tables,
+    treatments_table,
+)
 from vstent.geometry.vessel import Opening
 from vstent.study.progress import Progress
 
@@ -96,3 +107,50 @@ def test_devices_are_listed_by_use_and_found_by_maker(capsys: pytest.CaptureFixt
     assert "Flow diverters" not in told
     assert main(["devices", "--find", "no such"]) == 2
     assert "No device has 'no such'" in capsys.readouterr().err
+
+
+def printed(*tables: Table) -> str:
+    console = Console(width=80)
+    with console.capture() as told:
+        for table in tables:
+            console.print(table)
+    return told.get()
+
+
+def test_rankings_and_cohorts_fit_80_columns_and_no_word_is_cut() -> None:
+    flows = {
+        "neck_inflow_change_fraction": -0.41,
+        "sac_velocity_change_fraction": -0.64,
+        "contrast_retention_change_fraction": 1.11,
+        "flow_uncertainty_fraction": 0.01,
+        "flow_grade": "not usable",
+    }
+    sizes = {"deployed_length_low_mm": 19.7, "deployed_length_high_mm": 22.0, "landing_length_mm": 8.5}
+    measures = DEPLOYED | sizes | flows
+    label, design = "Enterprise 4.50 x 22 mm", SimpleNamespace(key="enterprise")
+    best = SimpleNamespace(label=label, shift_mm=-2.0, is_proposed=True, score=0.8, is_suitable=True)
+    best.measures, best.design = measures, design
+    told = printed(*ranking_tables(SimpleNamespace(candidates=[best], suitable=[best]), 15))
+    words = [
+        "4.50 x 22",
+        "@-2",
+        "(19.7-22.0)",
+        "apposed",
+        "beyond",
+        "−41 %",
+        "+111 %",
+        "velocity",
+        "retention",
+        "usable",
+    ]
+    assert [word for word in words if word not in told] == []
+    row = flows | {"score": 0.8, "is_suitable": True, "jailed_branches": {"outlet_2": -0.12}}
+    names = ["silk", "silk+silk_2", "web_sl", "enterprise+coils", "c25=coils"]
+    told = printed(treatments_table([row | {"treatment": name} for name in names]))
+    assert [
+        word for word in ["jailed branches", "outlet 2", "−12 %", "−41 %", "80", "web_sl"] if word not in told
+    ] == []
+    done = {"outcome": "done", "implant.deployed_length_mm": 16.3, "change.neck_inflow_mL_s_ratio": 0.49}
+    told = printed(cohort_table([done | {"treatment": name} for name in names]))
+    assert [word for word in ["length, mm", "neck inflow, after", "16.3", "0.49", "lost"] if word not in told] == []
+    assert "…" not in told

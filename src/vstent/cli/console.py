@@ -230,32 +230,34 @@ FLOW_COLUMNS: Final = (
 """Columns of a ranking by flow: title, key of the measure and number format."""
 
 
-def ranking_table(ranking: Ranking, shown: int) -> Table:
-    """Return the table of the best candidates of a ranking."""
-    measured = {key for candidate in ranking.candidates for key in candidate.measures}
-    columns = RANKING_COLUMNS + tuple(column for column in FLOW_COLUMNS if column[1] in measured)
-    is_shifted = any(candidate.shift_mm for candidate in ranking.candidates)
-    shift = ["mm shifted"] if is_shifted else []
-    table = Table("", "device and size, mm", *shift, "score", *(title for title, _, _ in columns))
-    for number, candidate in _shown(ranking, shown):
-        measures = candidate.measures
-        cells = ["" if measures.get(key) is None else _typed(form, measures[key]) for _, key, form in columns]
-        if "deployed_length_low_mm" in measures:
-            cells[0] += f" ({measures['deployed_length_low_mm']:.1f}-{measures['deployed_length_high_mm']:.1f})"
-        label = f"{candidate.label.removesuffix(' mm')}{' *' if candidate.is_proposed else ''}"
-        shift = [f"{candidate.shift_mm:+g}"] if is_shifted else []
-        score = f"{100 * candidate.score:.0f}" if candidate.is_suitable else "out"
-        table.add_row(str(number), label, *shift, score, *cells)
-    for column in table.columns:  # a title a word a line, so that 80 columns are enough
-        column.max_width = max(5, *(len(word) for word in f"{column.header} x".split()))
-        column.overflow = "fold"
-    table.columns[1].max_width, table.columns[1].no_wrap = None, True
-    table.columns[3 + is_shifted].max_width = len("(18.1-24.3)")
-    table.caption = (
+def ranking_tables(ranking: Ranking, shown: int) -> list[Table]:
+    """Return the table of the best candidates of a ranking, and one of their flows where there are any."""
+    tables = []
+    for all_columns in (RANKING_COLUMNS, FLOW_COLUMNS):
+        rows = [one for one in _shown(ranking, shown) if one[1].measures.get(all_columns[0][1]) is not None]
+        columns = [one for one in all_columns if any(one[1] in candidate.measures for _, candidate in rows)]
+        table = Table("", "device and size, mm", *["score"] * (not tables), *(title for title, _, _ in columns))
+        for number, candidate in rows:
+            measures = candidate.measures
+            cells = ["" if measures.get(key) is None else _typed(form, measures[key]) for _, key, form in columns]
+            if "deployed_length_low_mm" in measures and all_columns is RANKING_COLUMNS:
+                cells[0] += f" ({measures['deployed_length_low_mm']:.1f}-{measures['deployed_length_high_mm']:.1f})"
+            label = candidate.label.removesuffix(" mm") + f" @{candidate.shift_mm:+g}" * bool(candidate.shift_mm)
+            if not tables:
+                cells.insert(0, f"{100 * candidate.score:.0f}" if candidate.is_suitable else "out")
+            table.add_row(str(number), f"{label}{' *' if candidate.is_proposed else ''}", *cells)
+        for column in table.columns:  # a title a word a line, so that 80 columns are enough
+            column.max_width = max(6, *(len(word) for word in f"{column.header} x".split()))
+            column.overflow = "fold"
+        table.columns[1].max_width = None
+        if not tables:
+            table.columns[3].max_width = len("(18.1-24.3)")
+        tables += [table] if rows else []
+    tables[0].caption = (
         f"{len(ranking.candidates)} tried, {len(ranking.suitable)} suitable; scores of 100. * is the size that vstent "
-        "run proposes. In brackets: 95 % band from the ranges of the device's numbers."
+        "run proposes, @ a shift in mm. In brackets: 95 % band from the ranges of the device's numbers."
     )
-    return table
+    return tables
 
 
 def treatments_table(ranked: Sequence[Mapping[str, Any]]) -> Table:
