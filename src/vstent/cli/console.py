@@ -232,7 +232,7 @@ FLOW_COLUMNS: Final = (
 
 def ranking_tables(ranking: Ranking, shown: int) -> list[Table]:
     """Return the table of the best candidates of a ranking, and one of their flows where there are any."""
-    tables = []
+    tables: list[Table] = []
     for all_columns in (RANKING_COLUMNS, FLOW_COLUMNS):
         rows = [one for one in _shown(ranking, shown) if one[1].measures.get(all_columns[0][1]) is not None]
         columns = [one for one in all_columns if any(one[1] in candidate.measures for _, candidate in rows)]
