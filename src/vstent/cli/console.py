@@ -266,8 +266,7 @@ def treatments_table(ranked: Sequence[Mapping[str, Any]]) -> Table:
     (_, *names), *measures = list(zip(head, *rows, strict=True))[1:]
     table = _table("treatment", *names)
     for cells in measures:
-        if any(cells[1:]):
-            table.add_row(*map(_spaced, cells))
+        table.add_row(*map(_spaced, cells))
     table.caption = "The best first; scores of 100. With jailed branches: the change of their flow."
     return table
 

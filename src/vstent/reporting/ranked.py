@@ -19,8 +19,7 @@ COLUMNS: Final = (
 
 def treatment_rows(ranked: Sequence[Mapping[str, Any]]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Return titles, and a row for every treatment, with the jailed branches by name and the change of their flow."""
-    is_rigid, rows = not any(COLUMNS[2][1] in row for row in ranked), []
-    columns = [one for one in COLUMNS if not (is_rigid and one is COLUMNS[2])]
+    rows, columns = [], [one for one in COLUMNS if any(row.get(one[1]) is not None for row in ranked)]
     for number, row in enumerate(ranked, start=1):
         cells = ["" if row.get(key) is None else spoken(form.format(row[key])) for _, key, form in columns]
         jailed = ", ".join(spoken(f"{role} {change:+.0%}") for role, change in row["jailed_branches"].items())

@@ -20,8 +20,6 @@ NUMBERS: Final = {
     STIFFNESS: "stiffness of the device relative to wall and bed",
 }
 """Display names of the numbers of the catalogue."""
-ORDINALS: Final = (*("", "", "second", "third", "fourth"), *(f"{n}th" for n in range(5, 21)))
-"""Ordinal numbers from two, in words as far as a sentence needs them."""
 HEADLINES: Final = ("deployed_length_mm", "neck_metal_coverage_fraction")
 """Results that the sentence on a device names."""
 CAUSES: Final = {
@@ -60,7 +58,8 @@ def number_name(name: str) -> str:
     group = re.fullmatch(r"wire_(\d+)_(\w+)", name)
     if group is None:
         return NUMBERS.get(name, name)
-    return f"{NUMBERS[f'wire_{group[2]}']} of the {ORDINALS[int(group[1])]} kind of wire"
+    ordinal = {"2": "second", "3": "third", "4": "fourth"}.get(group[1], f"{group[1]}th")
+    return f"{NUMBERS[f'wire_{group[2]}']} of the {ordinal} kind of wire"
 
 
 def band_rows(implant: Mapping[str, Any]) -> list[Row]:
