@@ -27,6 +27,8 @@ BY_FLOW = {"choose_outlets", "measured_inflow", "see_an_angiogram", "compare_tre
 """Pages whose commands make no sense without a flow; those of the others leave it out here."""
 FORK = {"stents_at_a_fork", "compare_treatments"}
 """Pages whose artery ends in a fork."""
+FRAME = re.compile(r"[\s│┃]+")
+"""Spaces, line ends and the frames of tables."""
 ACROSS_MM = np.linspace(-1.9, 1.9, 9)
 
 
@@ -47,6 +49,11 @@ def commands(page: Path) -> list[list[str]]:
     text = "".join(dedent(block) for block in LITERAL.findall(page.read_text(encoding="utf-8")))
     lines = text.replace("\\\n", " ").splitlines()
     return [shlex.split(line, comments=True)[1:] for line in lines if line.lstrip().startswith("vstent ")]
+
+
+def promised(page: Path) -> list[str]:
+    """What the last paragraph of a page quotes, where it is a number: its commands print or write that."""
+    return re.findall(r"``([^`]*\d[^`]*)``", page.read_text(encoding="utf-8").rstrip().rsplit("\n\n", 1)[-1])
 
 
 @pytest.fixture(scope="session")
@@ -84,6 +91,8 @@ def test_every_command_of_a_page_runs(page, of_demo, tmp_path, monkeypatch, caps
         (tmp_path / "artery.stl").symlink_to(of_demo / "fork.stl")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    monkeypatch.setenv("COLUMNS", "200")
+    seen: list[str] = []
     catalogue.cache_clear()
     for words in commands(page):
         if APART & set(words):
@@ -92,7 +101,12 @@ def test_every_command_of_a_page_runs(page, of_demo, tmp_path, monkeypatch, caps
         given = [word for word in words[:target] if word not in LEFT_OUT or words[0] == "export"]
         if given[0] in ("run", "rank", "batch") and "--no-flow" not in given:
             given += ["--grid-spacing", "0.5"] if page.stem in BY_FLOW or given[0] == "rank" else ["--no-flow"]
-        assert cli.main(given) == 0, capsys.readouterr().err
-        told = capsys.readouterr().out
+        code, (out, err) = cli.main(given), capsys.readouterr()
+        assert code == 0, err
+        seen += [out, err]
         if target is not None:
-            Path(words[target + 1]).write_text(told, encoding="utf-8")
+            Path(words[target + 1]).write_text(out, encoding="utf-8")
+    seen += [path.read_text(encoding="utf-8").replace('"', "") for path in tmp_path.glob("*/metrics.json")]
+    plain = FRAME.sub(" ", " ".join(seen))
+    assert bool(promised(page)) == bool(seen)
+    assert [one for one in promised(page) if FRAME.sub(" ", one) not in plain] == []

@@ -172,9 +172,9 @@ class Option:
     """Whether the value is the path of a file, unless it is `alone` or one of `choices`."""
 
     @property
-    def placeholder(self) -> str | None:
-        """Placeholder of the value in the help; None: the name of the option."""
-        return self.metavar or PLACEHOLDERS.get(self.read) or re.sub(r"[ /]", "_", self.limits.unit.upper()) or None
+    def placeholder(self) -> str:
+        """Placeholder of the value in the help."""
+        return self.metavar or PLACEHOLDERS.get(self.read) or re.sub(r"[ /]", "_", self.limits.unit.upper()) or "X"
 
     def value(self, text: str) -> Any:
         """Return a value read from the command line; InputError where the text is no value of this option."""

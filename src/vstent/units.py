@@ -24,4 +24,4 @@ def counted(n: int, one: str, many: str = "") -> str:
 
 def place(point_mm: Iterable[float]) -> str:
     """Return a point (3,) as text: ``(1.0, -2.5, 30.2) mm``."""
-    return f"({', '.join(f'{x:.1f}' for x in point_mm)}) mm"
+    return f"({', '.join(f'{x:z.1f}' for x in point_mm)}) mm"

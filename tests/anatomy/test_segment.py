@@ -132,7 +132,7 @@ def test_the_band_told_for_five_per_cent_is_what_happens(demo):
     _, image, vessel = demo
     told = vessel.threshold_band_mm
     assert told == pytest.approx(
-        float(re.search(r"changes diameters by \+-([\d.]+) mm", " ".join(vessel.notes))[1]), abs=5e-4
+        float(re.search(r"changes diameters by ±([\d.]+) mm", " ".join(vessel.notes))[1]), abs=5e-4
     )
     level = threshold_of(vessel)
     low, high = (segment(image, threshold=level + off).lumen for off in (-100.0, 100.0))  # the step is 2000

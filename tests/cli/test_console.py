@@ -1,10 +1,21 @@
 """What the terminal's tables say: every value with the unit and the digits of the report."""
 
+from types import SimpleNamespace
+
 import pytest
+from rich.console import Console
 from rich.table import Table
 
 from vstent.cli import main
-from vstent.cli.console import _state, comparison_table, flow_table, opening_table
+from vstent.cli.console import (
+    _state,
+    cohort_table,
+    comparison_table,
+    flow_table,
+    opening_table,
+    ranking_tables,
+    treatments_table,
+)
 from vstent.geometry.vessel import Opening
 from vstent.study.progress import Progress
 
@@ -31,9 +42,9 @@ def test_the_comparison_tells_every_value_with_its_unit() -> None:
         "Deployed length": "23.0 mm",
         "Apposed": "91.7 %",
         "Metal coverage over the neck": "13.0 %",
-        "Neck inflow": "4.45 mL/s (-35%)",
-        "Mean sac velocity": "0.238 m/s (-41%)",
-        "Turnover time": "0.0880 s (+54%)",
+        "Neck inflow": "4.45 mL/s (−35 %)",
+        "Mean sac velocity": "0.238 m/s (−41 %)",
+        "Turnover time": "0.0880 s (+54 %)",
     }
 
 
@@ -43,7 +54,7 @@ def test_the_flows_table_compares_numbers_and_not_how_sure_they_are() -> None:
     metrics = {"treatments": {"bare": {"flow": BARE | sure}, "silk": silk}}
     names, bare, silk = columns(flow_table(metrics))
     assert (bare[-1], silk[-1]) == ("2.79 %", "0.762 %")
-    assert silk[names.index("Neck inflow")] == "4.45 mL/s (-35%)"
+    assert silk[names.index("Neck inflow")] == "4.45 mL/s (−35 %)"
 
 
 def test_of_several_implants_every_measure_is_told_in_their_order() -> None:
@@ -61,7 +72,7 @@ def test_of_several_implants_every_measure_is_told_in_their_order() -> None:
     [
         (Progress("flow silk", 0.5, residual=0.0279, seconds_left=61.4), "2.8% from convergence, 61 s left"),
         (Progress("vary silk", 0.5, "3 of 32"), "3 of 32"),
-        (Progress("angiogram bare", 0.5, seconds_left=0.0), "0 s left"),
+        (Progress("angiogram bare", 0.5, seconds_left=0.0), "1 s left"),
         (Progress("segment", 0.0), ""),
     ],
 )
@@ -87,7 +98,7 @@ def test_what_one_device_lacks_leaves_its_cell_empty_and_what_all_lack_has_no_ro
 def test_devices_are_listed_by_use_and_found_by_maker(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["devices"]) == 0
     told = capsys.readouterr().out
-    places = [told.index(title) for title in ("Flow diverters:", "Stents for coils:", "Baskets for the sac;")]
+    places = [told.index(title) for title in ("Flow diverters;", "Stents for coils;", "Baskets for the sac;")]
     assert places[0] < told.index(" pipeline ") < places[1] < told.index(" leo ") < places[2] < told.index(" contour ")
     assert main(["devices", "--find", "cerus"]) == 0
     told = capsys.readouterr().out
@@ -96,3 +107,52 @@ def test_devices_are_listed_by_use_and_found_by_maker(capsys: pytest.CaptureFixt
     assert "Flow diverters" not in told
     assert main(["devices", "--find", "no such"]) == 2
     assert "No device has 'no such'" in capsys.readouterr().err
+
+
+def printed(*tables: Table) -> str:
+    console = Console(width=80)
+    with console.capture() as told:
+        for table in tables:
+            console.print(table)
+    return told.get()
+
+
+def test_rankings_and_cohorts_fit_80_columns_and_no_word_is_cut() -> None:
+    flows = {
+        "neck_inflow_change_fraction": -0.41,
+        "sac_velocity_change_fraction": -0.64,
+        "contrast_retention_change_fraction": 1.11,
+        "flow_uncertainty_fraction": 0.01,
+        "flow_grade": "not usable",
+    }
+    sizes = {"deployed_length_low_mm": 19.7, "deployed_length_high_mm": 22.0, "landing_length_mm": 8.5}
+    measures = DEPLOYED | sizes | flows
+    label, design = "Enterprise 4.50 x 22 mm", SimpleNamespace(key="enterprise")
+    best = SimpleNamespace(label=label, shift_mm=-2.0, is_proposed=True, score=0.8, is_suitable=True)
+    best.measures, best.design = measures, design
+    told = printed(*ranking_tables(SimpleNamespace(candidates=[best], suitable=[best]), 15))
+    words = [
+        "4.50 x 22",
+        "@-2",
+        "(19.7-22.0)",
+        "apposed",
+        "beyond",
+        "−41 %",
+        "+111 %",
+        "velocity",
+        "retention",
+        "usable",
+    ]
+    assert [word for word in words if word not in told] == []
+    row = flows | {"score": 0.8, "is_suitable": True, "jailed_branches": {"outlet_2": -0.12}}
+    names = ["silk", "silk+silk_2", "web_sl", "enterprise+coils", "c25=coils"]
+    told = printed(treatments_table([row | {"treatment": name} for name in names]))
+    assert [
+        word for word in ["jailed branches", "outlet 2", "−12 %", "−41 %", "80", "web_sl"] if word not in told
+    ] == []
+    done = {"outcome": "done", "implant.deployed_length_mm": 16.3, "change.neck_inflow_mL_s_ratio": 0.49}
+    told = printed(cohort_table([done | {"treatment": name} for name in names]))
+    assert [
+        word for word in ["length, mm", "neck inflow,", "after / before", "16.3", "0.49", "lost"] if word not in told
+    ] == []
+    assert "…" not in told

@@ -19,7 +19,8 @@ def parsers(parser: argparse.ArgumentParser) -> list[argparse.ArgumentParser]:
 @pytest.mark.parametrize("command", parsers(cli._parser())[1:], ids=lambda one: one.prog)
 def test_every_help_has_a_summary_and_an_example_that_parses(command: argparse.ArgumentParser) -> None:
     text = command.format_help()
-    assert re.match(r"[A-Z].*\.$", command.description)
+    assert re.match(r"(?s)[A-Z].*\.$", command.description)
+    assert max(map(len, command.description.splitlines())) <= 80
     example = re.search(r"Example:\n  vstent (.*)\n", text)
     assert example, text
     assert example[1].startswith(command.prog.removeprefix("vstent "))

@@ -282,6 +282,15 @@ def test_the_order_of_devices_in_a_sac_is_checked_before_any_is_deployed(tmp_pat
     assert not stages
 
 
+def test_every_coil_that_is_placed_is_reported(tmp_path):
+    told = []
+    settings = Settings(treatments=(read_treatment("coils(8%)"),), flow=None)
+    found, _ = deploy_all(SAC, settings, Store(tmp_path, told.append), study_keys("", settings))
+    n_coils = len(found["coils"]["coils"].stent.coils)
+    words = [f"{k} {'coil' if k == 1 else 'coils'} placed" for k in range(1, n_coils + 1)]
+    assert [one.detail for one in told if 0 < one.fraction < 1][:n_coils] == words
+
+
 def test_more_than_the_density_asked_for_is_explained():
     deployment = deploy_coils(COILS, SAC, 0.005)
     assert deployment.stent.density_fraction > 0.015

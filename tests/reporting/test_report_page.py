@@ -240,7 +240,7 @@ def test_units_are_the_longest_ending(key, expected):
 
 
 def test_sentences_of_the_program_are_said_as_on_a_page():
-    note = "The inlet, 4.2 mm wide at (-0.2, 1.8) mm; +-0.067 mm, 5% of outlet_2. Choose the inlet (--inlet), or none."
+    note = "The inlet, 4.2 mm wide at (-0.2, 1.8) mm; ±0.067 mm, 5% of outlet_2. Choose the inlet (--inlet), or none."
     assert spoken(note) == (
         "The inlet, 4.2 mm wide at (−0.2, 1.8) mm; ±0.067 mm, 5\u202f% of outlet 2. Choose the inlet, or none."
     )

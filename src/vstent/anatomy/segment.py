@@ -108,7 +108,7 @@ def segment(image: Image, *, threshold: float | None = None, at_mm: Floats | Non
     off = BAND * (profile.lumen - profile.tissue)
     band_mm = 2 * off / profile.slope_per_mm
     band = f"A change of the threshold by {off:.3g} ({BAND:.0%} of the step from tissue to lumen) changes diameters by "
-    band += f"+-{band_mm:.3f} mm ({band_mm / lumen.voxel_mm:.2f} voxel)."
+    band += f"±{band_mm:.3f} mm ({band_mm / lumen.voxel_mm:.2f} voxel)."
     smoothing_note = f"Smoothing changed the volume by {-lost / volume_mm3:+.2%}; the change was corrected."
     notes = [*image.notes, note, band, count, smoothing_note]
     if len(surface.faces) > MOST_FACES:  # reduced by quadric error (Garland and Heckbert 1997, SIGGRAPH)

@@ -22,6 +22,8 @@ from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Floats
 from vstent.units import place
 
+LISTED: Final = 3
+"""Largest number of bulges that a note on those that were cut off lists."""
 UPSTREAM_MM: Final = 35.0
 """Default length of artery upstream of the sac's middle, in mm: half of the longest device, and five diameters for the
 flow to develop."""
@@ -116,29 +118,27 @@ def trim(
     if not cuts:
         return vessel
     inlet_mm, inlet_notes = _inlets_of(vessel, cuts, lumen)
-    lost = [
-        f"Another bulge, {bulge.height_mm:.1f} mm high at {place(bulge.dome_mm)}, was cut off; choose it by "
-        "that point (--at)."
-        for bulge in bulges[1:]
-        if lumen.closest(bulge.dome_mm[None])[1][0] > bulge.height_mm / 2
-    ]
-    notes = (*vessel.notes, *_notes(before, beyond), *inlet_notes, *lost)
+    lost = [one for one in bulges[1:] if lumen.closest(one.dome_mm[None])[1][0] > one.height_mm / 2]
+    notes = (*vessel.notes, *_notes(before, beyond, place(bulges[0].dome_mm), lost), *inlet_notes)
     return trace(replace(vessel, lumen=lumen, openings=(), centerlines=(), notes=notes), inlet_mm=inlet_mm)
 
 
-def _notes(before: _Way, beyond: _Way) -> list[str]:
-    """Return notes on the lengths that are kept."""
+def _notes(before: _Way, beyond: _Way, at: str, lost: list[Bulge]) -> list[str]:
+    """Return notes on the lengths that are kept beside a bulge, and on the bulges that are cut off."""
     trimmed = (
         f"Trimmed to {before.kept_mm:.4g} mm of vessel proximal and {beyond.kept_mm:.4g} mm distal to the "
-        "middle of the sac."
+        f"middle of the bulge at {at}."
     )
     longer = [
-        f"{way.kept_mm:.4g} mm are kept {way.side} the middle of the sac instead of {way.usual_mm:g}, "
+        f"{way.kept_mm:.4g} mm are kept {way.side} the middle of the bulge instead of {way.usual_mm:g}, "
         f"because the neck extends {way.neck_mm:.1f} mm from there."
         for way in (before, beyond)
         if way.is_short
     ]
-    return [trimmed, *longer]
+    highest = sorted(lost, key=lambda bulge: -bulge.height_mm)[:LISTED]
+    places = ", ".join(f"{bulge.height_mm:.1f} mm at {place(bulge.dome_mm)}" for bulge in highest)
+    cut = f"Other bulges that were cut off: {len(lost)}, the highest {places}. Choose one by its point (--at)."
+    return [trimmed, *longer, *([cut] if lost else [])]
 
 
 def _inlets_of(vessel: Vessel, cuts: list[tuple[Floats, float, int]], lumen: Surface) -> tuple[Floats, list[str]]:

@@ -79,7 +79,7 @@ def _done(arguments: argparse.Namespace) -> int:
 
 def _first_use() -> None:
     """Print a notice that the kernels are being compiled."""
-    said = "first use of this version: compiling its kernels, which takes about half a minute once."
+    said = "first use of this version: compiling its numerical loops, which takes about half a minute once."
     print(f"vstent: {said}", file=sys.stderr, flush=True)
 
 

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from rich.console import Console as RichConsole
 from rich.status import Status
-from rich.table import Table
+from rich.table import Column, Table
 
 from vstent.devices.design import Design
 from vstent.devices.fit import Fitted
@@ -21,11 +21,12 @@ from vstent.geometry.vessel import Opening
 from vstent.plan.rank import Candidate, Ranking
 from vstent.reporting.definitions import INDICES_WITH_OCCLUSION
 from vstent.reporting.quality import qualities
-from vstent.reporting.quantities import ERRORS, flatten, format_change, format_value, opening_rows
+from vstent.reporting.quantities import ERRORS, flatten, format_change, format_value, opening_rows, spoken
 from vstent.reporting.ranked import treatment_rows
 from vstent.reporting.uncertainty import ends, how_sure, intervals, number_name
 from vstent.study.followup import Followup
 from vstent.study.progress import Progress
+from vstent.units import counted
 
 ROWS: Final = (
     ("Neck inflow", "neck_inflow_mL_s"),
@@ -126,14 +127,14 @@ def _state(told: Progress) -> str:
         parts.append(f"{told.residual:.1%} from convergence")
     if told.seconds_left is not None:
         left_s = told.seconds_left
-        parts.append(f"{left_s:.0f} s left" if left_s < 90 else f"about {left_s / 60:.0f} min left")
+        parts.append(f"{max(left_s, 1):.0f} s left" if left_s < 90 else f"about {left_s / 60:.0f} min left")
     return ", ".join(part for part in parts if part)
 
 
 def comparison_table(metrics: Mapping[str, Any]) -> Table:
     """Return the table of the main results: in the bare artery, and with each treatment and its relative change."""
     treatments, bare = _treatments(metrics), _bare(metrics)
-    table = Table("", BARE, *treatments)
+    table = _table("", "no device", *treatments)
     for title, key in DEVICE_ROWS:
         cells = [
             " + ".join(
@@ -154,6 +155,11 @@ def comparison_table(metrics: Mapping[str, Any]) -> Table:
     return table
 
 
+def _table(title: str, *treatments: str) -> Table:
+    """Return an empty table with a column for every treatment; however narrow it is, no name is cut."""
+    return Table(title, *(Column(name, overflow="fold") for name in treatments))
+
+
 def _treatments(metrics: Mapping[str, Any]) -> dict[str, Any]:
     """Return the metrics of all treatments with implants, by name."""
     return {name: treatment for name, treatment in metrics["treatments"].items() if name != BARE}
@@ -165,20 +171,14 @@ def _bare(metrics: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def device_sentences(metrics: Mapping[str, Any]) -> list[str]:
-    """Return how sure each device is, one text each, with the ranges of all its implants."""
-    by_device: dict[str, dict[str, Any]] = {}
+    """Return how sure each device is, one text each; the ranges are those of its first implant."""
+    first: dict[str, tuple[Any, str]] = {}
     for name, treatment in _treatments(metrics).items():
         for key, implant in treatment["implants"].items():
             if implant.get("bands"):
-                title = name if len(treatment["implants"]) == 1 else f"{key} of {name}"
-                by_device.setdefault(implant["bands"]["device"], {})[title] = implant
-    sentences = []
-    for implants in by_device.values():
-        titles = implants if len(implants) > 1 else [""]
-        parts = zip(implants.values(), titles, strict=True)
-        told = (how_sure(implant, title, is_repeated=n > 0) for n, (implant, title) in enumerate(parts))
-        sentences.append(_spaced(" ".join(told)))
-    return sentences
+                title = name if key == name else f"{key} of {name}"
+                first.setdefault(implant["bands"]["device"], (implant, title))
+    return [_spaced(how_sure(*one)) for one in first.values()]
 
 
 def _add_flow_rows(table: Table, metrics: Mapping[str, Any], titles: Mapping[str, str]) -> None:
@@ -203,7 +203,7 @@ def _add_flow_rows(table: Table, metrics: Mapping[str, Any], titles: Mapping[str
             table.add_row(title, _cell(key, bare[key]), *shown)
 
 
-COHORT_COLUMNS: Final = (
+COHORT_ROWS: Final = (
     ("length, mm", "implant.deployed_length_mm", "{:.1f}"),
     ("apposed", "implant.apposed_fraction", "{:.0%}"),
     ("metal at neck", "implant.neck_metal_coverage_fraction", "{:.0%}"),
@@ -212,7 +212,7 @@ COHORT_COLUMNS: Final = (
     ("CPU s a case", "case_cpu_s", "{:.1f}"),
     ("MB", "peak_memory_MB", "{:.0f}"),
 )
-"""Columns of the cohort table: title, key and number format."""
+"""Rows of the cohort table: title, key and number format."""
 RANKING_COLUMNS: Final = (
     ("mm long", "deployed_length_mm", "{:.1f}"),
     ("apposed", "apposed_fraction", "{:.0%}"),
@@ -230,41 +230,44 @@ FLOW_COLUMNS: Final = (
 """Columns of a ranking by flow: title, key of the measure and number format."""
 
 
-def ranking_table(ranking: Ranking, shown: int) -> Table:
-    """Return the table of the best candidates of a ranking."""
-    measured = {key for candidate in ranking.candidates for key in candidate.measures}
-    columns = RANKING_COLUMNS + tuple(column for column in FLOW_COLUMNS if column[1] in measured)
-    is_shifted = any(candidate.shift_mm for candidate in ranking.candidates)
-    shift = ["mm shifted"] if is_shifted else []
-    table = Table("", "device and size, mm", *shift, "score", *(title for title, _, _ in columns))
-    for number, candidate in _shown(ranking, shown):
-        measures = candidate.measures
-        cells = ["" if measures.get(key) is None else form.format(measures[key]) for _, key, form in columns]
-        if "deployed_length_low_mm" in measures:
-            cells[0] += f" ({measures['deployed_length_low_mm']:.1f}-{measures['deployed_length_high_mm']:.1f})"
-        label = f"{candidate.label.removesuffix(' mm')}{' *' if candidate.is_proposed else ''}"
-        shift = [f"{candidate.shift_mm:+g}"] if is_shifted else []
-        score = f"{100 * candidate.score:.0f}" if candidate.is_suitable else "out"
-        table.add_row(str(number), label, *shift, score, *cells)
-    for column in table.columns:  # a title a word a line, so that 80 columns are enough
-        column.max_width = max(5, *(len(word) for word in f"{column.header} x".split()))
-        column.overflow = "fold"
-    table.columns[1].max_width, table.columns[1].no_wrap = None, True
-    table.columns[3 + is_shifted].max_width = len("(18.1-24.3)")
-    table.caption = (
+def ranking_tables(ranking: Ranking, shown: int) -> list[Table]:
+    """Return the table of the best candidates of a ranking, and one of their flows where there are any."""
+    tables: list[Table] = []
+    for all_columns in (RANKING_COLUMNS, FLOW_COLUMNS):
+        rows = [one for one in _shown(ranking, shown) if one[1].measures.get(all_columns[0][1]) is not None]
+        columns = [one for one in all_columns if any(one[1] in candidate.measures for _, candidate in rows)]
+        table = Table("", "device and size, mm", *["score"] * (not tables), *(title for title, _, _ in columns))
+        for number, candidate in rows:
+            measures = candidate.measures
+            cells = ["" if measures.get(key) is None else _typed(form, measures[key]) for _, key, form in columns]
+            if "deployed_length_low_mm" in measures and all_columns is RANKING_COLUMNS:
+                cells[0] += f" ({measures['deployed_length_low_mm']:.1f}-{measures['deployed_length_high_mm']:.1f})"
+            label = candidate.label.removesuffix(" mm") + f" @{candidate.shift_mm:+g}" * bool(candidate.shift_mm)
+            if not tables:
+                cells.insert(0, f"{100 * candidate.score:.0f}" if candidate.is_suitable else "out")
+            table.add_row(str(number), f"{label}{' *' if candidate.is_proposed else ''}", *cells)
+        for column in table.columns:  # a title a word a line, so that 80 columns are enough
+            column.max_width = max(6, *(len(word) for word in f"{column.header} x".split()))
+            column.overflow = "fold"
+        table.columns[1].max_width = None
+        if not tables:
+            table.columns[3].max_width = len("(18.1-24.3)")
+        tables += [table] if rows else []
+    tables[0].caption = (
         f"{len(ranking.candidates)} tried, {len(ranking.suitable)} suitable; scores of 100. * is the size that vstent "
-        "run proposes. In brackets: 95 % band from the ranges of the device's numbers."
+        "run proposes, @ a shift in mm. In brackets: 95 % band from the ranges of the device's numbers."
     )
-    return table
+    return tables
 
 
 def treatments_table(ranked: Sequence[Mapping[str, Any]]) -> Table:
     """Return the table of ranked treatments."""
     head, rows = treatment_rows(ranked)
-    table = Table(*head)
-    for row in rows:
-        table.add_row(*row)
-    table.caption = "Scores of 100; with jailed branches: the change of their flow."
+    (_, *names), *measures = list(zip(head, *rows, strict=True))[1:]
+    table = _table("treatment", *names)
+    for cells in measures:
+        table.add_row(*map(_spaced, cells))
+    table.caption = "The best first; scores of 100. With jailed branches: the change of their flow."
     return table
 
 
@@ -288,18 +291,17 @@ def _shown(ranking: Ranking, count: int) -> list[tuple[int, Candidate]]:
 
 
 def cohort_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Return the table of a cohort: one row per treatment with medians over the finished cases."""
-    columns = [column for column in COHORT_COLUMNS if any(row.get(column[1]) is not None for row in rows)]
-    table = Table("treatment", "done", "failed", "lost", *(title for title, _, _ in columns))
-    for treatment in dict.fromkeys(row["treatment"] for row in rows):
-        own = [row for row in rows if row["treatment"] == treatment]
-        counts = [str(sum(row["outcome"] == outcome for row in own)) for outcome in ("done", "failed", "lost")]
-        found = [[row[key] for row in own if row.get(key) is not None] for _, key, _ in columns]
-        cells = [
-            form.format(median(values)) if values else "" for values, (*_, form) in zip(found, columns, strict=True)
-        ]
-        table.add_row(treatment, *counts, *cells)
-    table.caption = "medians"
+    """Return the table of a cohort: one column per treatment with medians over the finished cases."""
+    names = dict.fromkeys(row["treatment"] for row in rows)
+    own = [[row for row in rows if row["treatment"] == name] for name in names]
+    table = _table("treatment", *names)
+    for outcome in ("done", "failed", "lost"):
+        table.add_row(outcome, *(str(sum(row["outcome"] == outcome for row in some)) for some in own))
+    for title, key, form in COHORT_ROWS:
+        found = [[row[key] for row in some if row.get(key) is not None] for some in own]
+        if any(found):
+            table.add_row(title, *(_typed(form, median(values)) if values else "" for values in found))
+    table.caption = "Medians of the finished cases."
     return table
 
 
@@ -331,14 +333,14 @@ def morphology_table(measures: Mapping[str, Any]) -> Table:
 
 def flow_table(metrics: Mapping[str, Any]) -> Table:
     """Return the table of all flow indices: bare, and with each treatment and its relative change."""
-    table = Table("flow", BARE, *_treatments(metrics))
+    table = _table("flow", "no device", *_treatments(metrics))
     _add_flow_rows(table, metrics, {quantity.key: quantity.name for quantity in flatten(_bare(metrics))})
     return table
 
 
 def angiogram_table(metrics: Mapping[str, Any]) -> Table:
     """Return the table of angiograms: bare, and with each treatment and its relative change."""
-    table = Table("angiogram", BARE, *_treatments(metrics))
+    table = _table("angiogram", "no device", *_treatments(metrics))
     _add_flow_rows(table, metrics, {key: _title(key) for key in CONTRAST_ROWS})
     table.caption = "\n".join([str(table.caption or ""), *INDICES_WITH_OCCLUSION]).strip()
     return table
@@ -382,6 +384,11 @@ def _cell(key: str, value: Any) -> str:
     return "" if value is None else _spaced(format_value(key, value))
 
 
+def _typed(form: str, value: Any) -> str:
+    """Return a value in a number format, with signs of typography."""
+    return _spaced(spoken(form.format(value)))
+
+
 def _spaced(text: str) -> str:
     """Return text with plain spaces instead of narrow ones, which some terminals lack."""
     return text.replace("\u202f", " ")
@@ -391,7 +398,7 @@ def _change(key: str, bare: float, value: float | None) -> str:
     """Return a value with its unit and its change; empty where there is none."""
     if value is None or key in ERRORS:
         return _cell(key, value)
-    change = _spaced(format_change(bare, value, key)).replace(" %", "%").replace("−", "-")
+    change = _spaced(format_change(bare, value, key))
     return f"{_cell(key, value)} ({change})" if change != "–" else _cell(key, value)
 
 
@@ -409,7 +416,7 @@ def device_table(devices: Mapping[str, Design]) -> Table:
     table = Table()
     # A name is typed as it stands: it is never cut, however narrow the terminal.
     table.add_column("name", no_wrap=True, min_width=max(map(len, devices), default=0))
-    for title in ("device", "construction", "sizes (diameter x length, mm)", "numbers with a cited source"):
+    for title in ("device", "construction", "sizes, mm", "numbers with a cited source"):
         table.add_column(title, overflow="fold")
     for name, design in devices.items():
         cited = sum(fact.confidence == "cited" for fact in design.facts)
@@ -418,7 +425,7 @@ def device_table(devices: Mapping[str, Design]) -> Table:
         spans = (
             " to ".join(dict.fromkeys(f"{mm:g}" for mm in (all_mm[0], all_mm[-1]))) for all_mm in (diameters, lengths)
         )
-        sizes = f"{' x '.join(spans)} ({len(design.sizes)} sizes)"
+        sizes = f"{' x '.join(spans)} ({counted(len(design.sizes), 'size')})"
         table.add_row(name, design.name, design.kind.replace("_", "-"), sizes, f"{cited} of {len(design.facts)}")
     return table
 
@@ -430,7 +437,7 @@ def fit_table(fitted: Fitted) -> Table:
         fitted.names, fitted.values, fitted.errors, fitted.prior_errors, fitted.is_determined, strict=True
     ):
         is_angle = name.endswith("_rad")
-        unit = "°" if is_angle else "um" if name.endswith("_um") else "mm"
+        unit = "°" if is_angle else "µm" if name.endswith("_um") else "mm"
         cells = (f"{degrees(x):.2f} {unit}" if is_angle else f"{x:.3f} {unit}" for x in (value, error, before))
         table.add_row(_number_title(name), *cells, "yes" if is_determined else "no, as the similar device")
     residuals = fitted.residuals
@@ -447,7 +454,7 @@ def correlation_table(fitted: Fitted) -> Table:
     """Return the table of correlations of the fitted numbers."""
     table = Table("correlation", *(str(k) for k in range(1, len(fitted.names) + 1)))
     for k, (name, row) in enumerate(zip(fitted.names, fitted.correlation, strict=True), start=1):
-        table.add_row(f"{k} {_number_title(name)}", *(f"{value:+.2f}" for value in row))
+        table.add_row(f"{k} {_number_title(name)}", *(_typed("{:+.2f}", value) for value in row))
     return table
 
 

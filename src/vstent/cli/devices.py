@@ -7,8 +7,8 @@ from typing import Final
 from vstent.cli import options
 
 USES: Final = {
-    "flow diverter": "Flow diverters",
-    "stent for coils": "Stents for coils",
+    "flow diverter": "Flow diverters; sizes are diameter x length",
+    "stent for coils": "Stents for coils; sizes are diameter x length",
     "basket": "Baskets for the sac; sizes are width x height",
     "coils": "Coils for the sac; sizes are diameter of the loops x length",
 }

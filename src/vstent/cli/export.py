@@ -66,6 +66,6 @@ def _patches(arguments: argparse.Namespace) -> int:
     with console.live():
         patches = export_patches(arguments.input, arguments.out, settings, console.progress)
     for patch in patches:
-        console.print(f"{patch['patch_id']:3d}  {patch['name']:10s} {patch['area_mm2']:9.2f} mm2")
+        console.print(f"{patch['patch_id']:3d}  {patch['name']:10s} {patch['area_mm2']:9.2f} mm²")
     console.print(f"Patches in {arguments.out}, lengths in mm. Research use only.")
     return 0

@@ -5,6 +5,7 @@ import os
 import re
 from collections.abc import Container
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from vstent import fields
@@ -14,8 +15,8 @@ from vstent.study.settings import OPTIONS, Settings, in_section, settings_of
 if TYPE_CHECKING:
     from vstent.study.workers import AbstractWorkers
 
-EPILOG: Final = "Lengths are in mm, coordinates are LPS. Research use only: not cleared for diagnosis or treatment."
-"""Last line of every help text."""
+EPILOG: Final = "Lengths are in mm, coordinates are LPS.\nResearch use only: not cleared for diagnosis or treatment."
+"""Last lines of every help text."""
 STUDY: Final = ("treatments", "straightening", "flow", "uncertainty")
 """Sections of the settings that concern a study of a vessel."""
 VESSEL: Final = ("input", "anatomy")
@@ -96,7 +97,7 @@ def add_command(commands: Commands, name: str, text: str, example: str) -> argpa
     parser = commands.add_parser(
         name,
         help=text[0].lower() + text[1:].rstrip("."),
-        description=text,
+        description=fill(text, 80),
         epilog=f"Example:\n  vstent {example}\n\n{EPILOG}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,

@@ -65,7 +65,7 @@ def _rank_treatments(arguments: argparse.Namespace) -> int:
 
 def _rank_sizes(arguments: argparse.Namespace) -> int:
     """Rank sizes of devices; return the exit code."""
-    from vstent.cli.console import Console, ranking_reasons, ranking_table
+    from vstent.cli.console import Console, ranking_reasons, ranking_tables
     from vstent.devices.catalogue import find_design
     from vstent.errors import InputError
     from vstent.flow.settings import FlowSettings
@@ -117,7 +117,8 @@ def _rank_sizes(arguments: argparse.Namespace) -> int:
             told = None if is_parallel else told_flows
             ranking = rank_flows(anatomy, ranking, flow, count, **has_contrast, stored=stored, progress=told)
     write_ranking(out, ranking)
-    console.print(ranking_table(ranking, SHOWN))
+    for table in ranking_tables(ranking, SHOWN):
+        console.print(table)
     console.print(ranking_reasons(ranking, SHOWN))
     console.print(f"All in {out / 'ranking.csv'} and ranking.json. Research use only.")
     return 0

@@ -86,7 +86,7 @@ class Implant:
         "device",
         "device of the catalogue",
         str,
-        usual="silk and enterprise",
+        usual="silk and enterprise; none for `vstent flow` and `vstent export`",
         metavar="NAME",
         separators=";, ",
     )

@@ -166,7 +166,7 @@ def too_fast(grid: Domain, speed_m_s: Floats, blood: Blood, most: float) -> str:
     share = float((cell_reynolds > most).mean())
     return (
         f" Under-resolved: in {100 * share:.2g} % of the cells the grid Reynolds number exceeds {most:.3g}, so the "
-        f"viscosity is raised there, up to {cell_reynolds[fastest] / most:.2g} times nominal. The fastest blood has "
+        f"viscosity is raised there, up to {cell_reynolds[fastest] / most:.3g} times nominal. The fastest blood has "
         f"{speed_m_s[fastest]:.2g} m/s at {place(grid.centers_mm[fastest])}; use a grid spacing finer than "
         f"{grid.cell_size_mm:.3g} mm to check the effect."
     )

@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+from vstent.reporting.quantities import spoken
+
 COLUMNS: Final = (
     ("neck inflow", "neck_inflow_change_fraction", "{:+.0%}"),
     ("sac velocity", "sac_velocity_change_fraction", "{:+.0%}"),
@@ -17,11 +19,10 @@ COLUMNS: Final = (
 
 def treatment_rows(ranked: Sequence[Mapping[str, Any]]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Return titles, and a row for every treatment, with the jailed branches by name and the change of their flow."""
-    is_rigid, rows = not any(COLUMNS[2][1] in row for row in ranked), []
-    columns = [one for one in COLUMNS if not (is_rigid and one is COLUMNS[2])]
+    rows, columns = [], [one for one in COLUMNS if any(row.get(one[1]) is not None for row in ranked)]
     for number, row in enumerate(ranked, start=1):
-        cells = ["" if row.get(key) is None else form.format(row[key]) for _, key, form in columns]
-        jailed = ", ".join(f"{role} {change:+.0%}" for role, change in row["jailed_branches"].items())
+        cells = ["" if row.get(key) is None else spoken(form.format(row[key])) for _, key, form in columns]
+        jailed = ", ".join(spoken(f"{role} {change:+.0%}") for role, change in row["jailed_branches"].items())
         score = f"{100 * row['score']:.0f}" if row["is_suitable"] else "out" if any(cells) else "none"
         rows.append((str(number), row["treatment"], score, *cells, jailed or ("none" if any(cells) else "")))
     return ("", "treatment", "score", *(title for title, _, _ in columns), "jailed branches"), rows

@@ -58,7 +58,8 @@ def number_name(name: str) -> str:
     group = re.fullmatch(r"wire_(\d+)_(\w+)", name)
     if group is None:
         return NUMBERS.get(name, name)
-    return f"{NUMBERS[f'wire_{group[2]}']} of the {('second', 'third', 'fourth')[int(group[1]) - 2]} kind of wire"
+    ordinal = {"2": "second", "3": "third", "4": "fourth"}.get(group[1], f"{group[1]}th")
+    return f"{NUMBERS[f'wire_{group[2]}']} of the {ordinal} kind of wire"
 
 
 def band_rows(implant: Mapping[str, Any]) -> list[Row]:

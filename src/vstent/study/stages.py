@@ -23,6 +23,7 @@ from vstent.deployment.coils import deploy_coils, given_coils
 from vstent.deployment.deploy import deploy, propose_landing, propose_size
 from vstent.deployment.forks import beyond_mm
 from vstent.deployment.measure import jailed_branches, measure, measure_together
+from vstent.deployment.method import Progress
 from vstent.deployment.straightening import Straightening, described, straighten
 from vstent.devices.catalogue import find_design, find_sizes
 from vstent.devices.design import Basket, Coil, Size
@@ -189,7 +190,8 @@ def deploy_all(
                 deployment = store.find(stage, keys[stage], Deployment)
                 if deployment is None:
                     with store.stage(stage) as tell:
-                        deployment = deploy_implant(implant, anatomy, [implants[name].stent for name in implant.inside])
+                        outer = [implants[name].stent for name in implant.inside]
+                        deployment = deploy_implant(implant, anatomy, outer, partial(_tell_coils, store, stage))
                         tell(deployment.advice)
                     store.defer(stage, keys[stage], deployment)
                 implants[implant.id] = deployment
@@ -215,7 +217,9 @@ def _check_in_sac(implant: Implant, treatment: Treatment) -> None:
         raise LandingError("Coils come last in a treatment, and only once: give other devices before them.")
 
 
-def deploy_implant(implant: Implant, anatomy: Anatomy, inside: Sequence[Stent] = ()) -> Deployment:
+def deploy_implant(
+    implant: Implant, anatomy: Anatomy, inside: Sequence[Stent] = (), progress: Progress | None = None
+) -> Deployment:
     """Deploy an implant in the given or proposed size and place, inside implants that are there in this order."""
     design = find_design(implant.device)
     if isinstance(design, Basket | Coil) and (implant.placing.path != PARENT or implant.placing.beside):
@@ -229,7 +233,7 @@ def deploy_implant(implant: Implant, anatomy: Anatomy, inside: Sequence[Stent] =
                 "parentheses."
             )
         filling = given_coils(design, implant.coils) if implant.coils else implant.density_fraction
-        return deploy_coils(design, anatomy, filling, inside=inside, seed=implant.seed)
+        return deploy_coils(design, anatomy, filling, inside=inside, seed=implant.seed, progress=progress)
     if implant.density_fraction is not None or implant.coils:
         raise LandingError(f"{design.name} has neither a packing density nor a list of coils: only coils have them.")
     anatomy = on_path(anatomy, implant.placing.path)
@@ -376,6 +380,11 @@ def compute_flows(
     return fields, failures
 
 
+def _tell_coils(store: Store, stage: str, n_coils: int, fraction: float) -> None:
+    """Report the progress of placing coils as that of its stage."""
+    store.progress(stage, 0.99 * fraction, f"{counted(n_coils, 'coil')} placed")
+
+
 def _tell_flow(store: Store, stage: str, now: FlowProgress) -> None:
     """Report the progress of a flow as that of its stage."""
     residual = now.residual if isfinite(now.residual) else None
@@ -430,7 +439,7 @@ def vary_all(
                     varied = vary(
                         way, deployment, settings.uncertainty, kept, straightening=settings.straightening, **how
                     )
-                tell(f"{len(varied.points)} deployments; {varied.n_failed} of them did not fit.")
+                tell(f"{len(varied.points) - varied.n_failed} of {len(varied.points)} deployments fit the artery.")
             store.save(stage, keys[stage], varied)
         spreads[treatment.name] = varied.metrics()
     return spreads

@@ -117,7 +117,7 @@ def test_a_length_that_was_not_given_grows_until_the_cut_clears_the_sac(
     monkeypatch.setattr(import_module("vstent.anatomy.trim"), usual, 2.0)
     trimmed = trim(sac_on_a_tube)
     (note,) = (note for note in trimmed.notes if "instead of 2, because the neck extends" in note)
-    assert f"mm are kept {side} the middle of the sac" in note
+    assert f"mm are kept {side} the middle of the bulge" in note
     kept_mm = float(note.split()[0])
     assert 2.0 + 2.0 < kept_mm < 2.0 + 2.0 + 1.5
     low, high = sorted(opening.center_mm[2] for opening in trimmed.openings)
