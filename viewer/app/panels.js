@@ -576,7 +576,7 @@ function depth(page) {
     page.askSlice();
   };
   const slider = make("input", { type: "range", min: -6, max: 6, step: 0.2, value, id: "field-cut", data: { key: "cut" }, onInput });
-  return [make("label", { className: "slider", htmlFor: "field-cut" }, [make("span", {}, ["Slice from the sac's middle ", words]), slider])];
+  return [make("label", { className: "slider", htmlFor: "field-cut" }, [make("span", {}, [`Slice from the ${page.anatomy?.neck.length ? "sac" : "artery"}'s middle `, words]), slider])];
 }
 
 const MODES = [["streamlines", "Streamlines"], ["slice", "Slice"], ["shear", "Wall shear stress"], ["sac_shear", "Shear stress, sac"], ["angiogram", "Angiogram"]];
@@ -587,5 +587,6 @@ function modes(page) {
     page.memory.flow = {};
     page.render();
   };
-  return tabs("Show", page.memory.mode || "streamlines", MODES, show, "tabs modes");
+  const modes = MODES.filter(([id]) => id !== "sac_shear" || page.anatomy?.neck.length);
+  return tabs("Show", page.memory.mode || "streamlines", modes, show, "tabs modes");
 }

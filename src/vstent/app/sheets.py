@@ -69,6 +69,8 @@ def device(title: str, measures: dict[str, Any]) -> Sheet:
 def flow(metrics: dict[str, Any], titles: dict[str, str]) -> list[Sheet]:
     """Return the table of the flow without a device, and with each device in the order of `titles`, with its change."""
     changes = compare(metrics, unusable(metrics))
+    keys = [change.before.key for change in changes]
+    first = {*HEADLINES} & {*keys} or {*keys[:8]}  # without a sac there is no headline
     rows = []
     for change in changes:
         cells, senses = [change.before.text], []
@@ -77,7 +79,7 @@ def flow(metrics: dict[str, Any], titles: dict[str, str]) -> list[Sheet]:
             of = "not usable" if name in change.hidden else change.of(name)
             cells += [after.text, of] if after else ["–", "–"]
             senses.append(change.sense(name) if after else "")
-        row = _row(change.before, cells, is_first=change.before.key in HEADLINES)
+        row = _row(change.before, cells, is_first=change.before.key in first)
         rows.append(row | {"senses": senses})
     rows.sort(key=lambda row: HEADLINES.index(row["key"]) if row["key"] in HEADLINES else len(HEADLINES))
     words: Sheet = {"title": "Blood flow", "names": list(titles), "devices": list(titles.values())}

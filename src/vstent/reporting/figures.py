@@ -124,13 +124,19 @@ def plates(scene: Scene) -> list[Plate]:
     sides = {"profile": "In profile", "frontal": "Frontal", "lateral": "From the left"}
     layers = ("lumen", "continued", "landing", "sac", "neck")
     shots = [Shot(title, scene.pick(layers, bare[0]), scene.view(view)) for view, title in sides.items()]
-    caption = "The patient's lumen (glass), the restored parent artery (sand), the sac (red) and the neck (red line)."
-    anatomy = Plate("anatomy", "The artery and its sac", caption, scene, shots)
     present = {layer.id for layer in scene.layers}
+    has_sac = "neck" in present
+    more = (
+        ", the restored parent artery (sand), the sac (red) and the neck (red line)"
+        if has_sac
+        else " and the parent artery"
+    )
+    title = f"The artery{' and its sac' * has_sac}"
+    anatomy = Plate("anatomy", title, f"The patient's lumen (glass){more}.", scene, shots)
     drawn = [*(by_value(*row) for row in _OF_FLOW if row[0] in present), anatomy]
     if devices:
         treated = ("lumen", "continued", "sac", "wires", "neck")
-        caption = "The devices in the patient's artery with its sac; the red line is the neck."
+        caption = f"The devices in the patient's artery{' with its sac; the red line is the neck' * has_sac}."
         title = "The treatment in the artery" if len(devices) == 1 else "The treatments in the artery"
         shots = [Shot(words, scene.pick(treated, pane), scene.view("profile")) for pane, words in devices]
         drawn.insert(0, Plate("treatment", title, caption, scene, shots))
@@ -139,10 +145,9 @@ def plates(scene: Scene) -> list[Plate]:
             "few pores. In a bend, wires at more than 45° to the axis (flow diverters) are denser on the inner side, "
             "and those at less than 45° (laser-cut closed cells) on the outer side."
         )
-        wires = (
-            "The wires and the neck (red line), seen from the sac without its wall and coils. "
-            "Wires on the far side are paler."
-        )
+        wires = "Wires on the far side are paler."
+        if has_sac:
+            wires = f"The wires and the neck (red line), seen from the sac without its wall and coils. {wires}"
         shots = [
             Shot(f"{title}: {shot.title.lower()}", shot.layers, shot.view)
             for pane, title in devices
@@ -153,7 +158,7 @@ def plates(scene: Scene) -> list[Plate]:
         if meshes:
             drawn.append(_contours(scene, meshes))
             drawn.append(by_value("coverage", ids, "Metal coverage of the wall", coverage, meshes))
-        drawn.append(Plate("wires", "Wires across the neck", wires, scene, shots))
+        drawn.append(Plate("wires", "Wires across the neck" if has_sac else "The wires", wires, scene, shots))
     return drawn
 
 

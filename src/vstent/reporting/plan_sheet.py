@@ -108,7 +108,7 @@ def _write(
 def _picture(case: Planned, name: str) -> Picture:
     """Return a treatment in profile and seen from the sac."""
     scene = scene_of(case.anatomy, {name: case.implants[name]}, {})
-    caption = "The device in the patient's artery; the red line is the neck."
+    caption = f"The device in the patient's artery{'; the red line is the neck' * bool(case.anatomy.aneurysms)}."
     return Plate("plan", "Position", caption, scene, wire_shots(scene, name, "sac")).drawn()
 
 
