@@ -267,6 +267,7 @@ def test_coils_join_a_stent_and_are_placed_as_densely_as_chosen(artery, tmp_path
         playwright.expect(page.locator(".advice")).to_contain_text("These coils are not placed yet")
         page.get_by_role("button", name="Place the coils").click()
         playwright.expect(page.locator(".advice")).to_contain_text("of the sac", timeout=240 * SECOND)
+        playwright.expect(page.locator(".step.done")).to_have_count(5)
         playwright.expect(page.get_by_role("button", name="Place the coils")).to_have_count(0)
         playwright.expect(page.locator(".sheet .term", has_text="Packing density")).to_have_count(1)
         page.locator("#field-coil").select_option("2,40")

@@ -17,7 +17,7 @@ from vstent.children import environment
 KINDS: Final = {
     "anatomy": ("image", "vessel", "sac"),
     "rank": ("device",),
-    "place": ("deploy",),
+    "place": ("device", "deploy"),
     "flow": ("device", "deploy", "flow", "report"),
     "angiogram": ("flow", "report"),
 }
