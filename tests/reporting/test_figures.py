@@ -231,3 +231,19 @@ def test_the_color_bar_shows_its_colors_and_the_length_bar_its_length():
     panel = lettering.blank(400, 120)
     lettering.length_bar(panel, 40.0, (0, 0), (400, 120))
     assert (np.asarray(panel)[114, :, 0] < 60).sum() == pytest.approx(100, abs=2)  # 10 mm of 40 mm
+
+
+def test_coils_hide_no_stent_that_is_seen_from_the_sac():
+    def lines(name: str, radius_mm: float) -> LineLayer:
+        return LineLayer(name, "one", (0, 0, 0), np.eye(3)[:2], np.array([0, 2], np.int32), np.array([radius_mm]))
+
+    strut, coil, neck = lines("wires", 0.04), lines("wires", 0.15), lines("neck", 0.08)
+    views = [View(name, np.eye(3), np.zeros(3), 1.0) for name in ("profile", "neck")]
+
+    def shots(*layers: LineLayer) -> list[tuple[LineLayer | MeshLayer, ...]]:
+        panes = (("bare", ""), ("one", ""))
+        scene = Scene(panes, layers, (), tuple(views), is_oriented=True, fade_mm=1.0)
+        return [shot.layers for shot in figures.wire_shots(scene, "one")]
+
+    assert shots(strut, coil, neck) == [(strut, coil, neck), (strut, neck)]
+    assert shots(coil, neck) == [(coil, neck), (coil, neck)]

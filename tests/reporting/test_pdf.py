@@ -83,6 +83,7 @@ def test_the_first_page_is_the_answer_and_the_appendix_begins_within_ten_pages(t
     first = " ".join(text for _, text in pages[0])
     for words in (told.name, told.origin, "Neck inflow", "Mean sac velocity", "Fit and warnings"):
         assert words in first
+    assert "Blood flow" in [text for _, text in pages[1]]
     (appendix,) = (k for k, page in enumerate(pages) if any(text == "Appendix: method" for _, text in page))
     assert appendix < 10
     lowest_in = [min(y for y, _ in page if y > 0.5) for page in pages[:appendix]]

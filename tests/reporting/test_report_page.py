@@ -244,6 +244,7 @@ def test_sentences_of_the_program_are_said_as_on_a_page():
     assert spoken(note) == (
         "The inlet, 4.2 mm wide at (−0.2, 1.8) mm; ±0.067 mm, 5\u202f% of outlet 2. Choose the inlet, or none."
     )
+    assert spoken("4.00 x 20 mm, 6 mm x 20 cm, x 3") == "4.00 × 20 mm, 6 mm × 20 cm, x 3"
     assert spoken("2026-11-28, 3-D, 1e-5, 18.8-35.1 mm") == "2026-11-28, 3-D, 1e-5, 18.8-35.1 mm"
 
 
