@@ -590,7 +590,7 @@ class Page {
   stageWords(stage) {
     const [first, name, id] = stage.split(" ");
     const words = SPOKEN[first] || stage;
-    if (!name || first === "plan") return words;
+    if (!name || ["plan", "stored"].includes(first)) return words;
     return `${words} ${name === "bare" ? "before" : this.names.treatment(name)}${id ? `: ${this.names.implant(name, id)}` : ""}`;
   }
 
@@ -734,7 +734,7 @@ function progressWords({ detail, residual, seconds_left }) {
 }
 const SPOKEN = {
   scan: "Scan", vessel: "Vessel", segment: "Wall", trace: "Centerlines", trim: "Trimming", restore: "Parent artery and sac", anatomy: "Anatomy", rank: "Sizes", rank_flow: "Flow of the best sizes",
-  deploy: "Deploying", struts: "Wires of", plan: "Run time of the flow", flow: "Flow,", vary: "Uncertainty of", measure: "Metrics", report: "Report", angiogram: "Angiogram,", film: "Films",
+  deploy: "Deploying", struts: "Wires of", plan: "Run time of the flow", stored: "Stored results", flow: "Flow,", vary: "Uncertainty of", measure: "Metrics", report: "Report", angiogram: "Angiogram,", film: "Films",
 };
 
 /** From where each step looks at first. */
