@@ -510,7 +510,7 @@ class Page {
   flowStrip() {
     const { job } = this.view;
     if (this.isFilm && this.films.hasFilm) return this.films.strip;
-    if (job?.kind !== "flow") return [];
+    if (job?.kind !== "flow" || !job.residuals.length) return [];
     const box = make("div", { className: "residual" }, [residualChart(job.residuals)]);
     box.append(chartButton("convergence", box));
     return [box];
