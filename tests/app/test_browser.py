@@ -40,6 +40,12 @@ def drawn(page, box):
     return float((np.abs(image - np.array([0xF6, 0xF8, 0xF9]) / 255).max(axis=2) > 0.01).mean())
 
 
+def filled(page):
+    """Words of the filled buttons of a step: what is to be done next."""
+    return page.evaluate("""() => [...document.querySelectorAll(".panel .wide")]
+        .filter((one) => getComputedStyle(one).color === "rgb(255, 255, 255)").map((one) => one.textContent)""")
+
+
 @pytest.fixture
 def artery(tmp_path):
     path = tmp_path / "phantom.stl"
@@ -57,6 +63,7 @@ def test_from_a_dropped_surface_to_a_device_dragged(artery, tmp_path):
         page.wait_for_selector(".opening b")
         playwright.expect(page.locator(".opening-row.inlet")).to_have_count(1)
         assert in_time(page, lambda: drawn(page, page.locator(".viewer-area").bounding_box()) > 0.05)
+        assert filled(page) == ["Sac and parent →"]
         trim_and_draw_the_neck(client, page)
         with page.expect_request(lambda request: request.url.endswith("/preview") and request.method == "POST"):
             step(page, "Deploy")  # the live flow is prepared, and its switch is off
@@ -142,6 +149,29 @@ def test_a_treatment_is_built_reordered_and_taken_apart_by_keys(artery, tmp_path
 
 
 @pytest.mark.system
+def test_why_a_treatment_is_not_deployed_stays_in_view(artery, tmp_path):
+    with app_case.served(tmp_path / "cases") as client, browsing(client, expected="422") as page:
+        drop(page, artery)
+        page.wait_for_selector(".step.done:nth-child(3)")
+        asked = []
+
+        def refuse(route):
+            asked.append(route.request.url)
+            route.fulfill(status=422, json={"detail": "These stents do not fit."})
+
+        page.route("**/deployment", refuse)
+        step(page, "Deploy")
+        why = page.locator(".place .note.failed")
+        playwright.expect(why).to_have_text("These stents do not fit.")
+        page.wait_for_timeout(SECOND)
+        assert len(asked) == 1
+        page.unroute("**/deployment")
+        page.get_by_role("button", name="Coverage").click()
+        playwright.expect(page.locator(".place")).to_contain_text("Deployed length")
+        playwright.expect(why).to_have_count(0)
+
+
+@pytest.mark.system
 def test_a_basket_is_chosen_and_pulled_out_of_the_sac(artery, tmp_path):
     with app_case.served(tmp_path / "cases") as client, browsing(client) as page:
         drop(page, artery)
@@ -220,6 +250,7 @@ def test_coils_join_a_stent_and_are_placed_as_densely_as_chosen(artery, tmp_path
         drop(page, artery)
         page.wait_for_selector(".step.done:nth-child(3)")
         step(page, "Treatment")
+        assert filled(page) == ["Deploy →"]
         page.locator("[data-key=device-silk]").uncheck()
         page.get_by_label("Add a device to Enterprise").select_option("coils")
         playwright.expect(page.locator(".implant > span")).to_have_text(
@@ -228,6 +259,8 @@ def test_coils_join_a_stent_and_are_placed_as_densely_as_chosen(artery, tmp_path
         playwright.expect(page.get_by_label("Add a device to Enterprise + Platinum coils")).to_have_count(0)
         step(page, "Deploy")
         page.get_by_role("button", name="2. Platinum coils").click()
+        page.get_by_role("button", name="Place the coils").wait_for()
+        assert filled(page) == ["Place the coils"]
         slider = page.locator("#field-density")
         slider.fill("5")
         assert in_time(page, lambda: chosen(client)["treatments"][0]["implants"][1]["density_fraction"] == 0.05)

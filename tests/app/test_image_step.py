@@ -172,8 +172,9 @@ def test_slices_are_linked_and_measure_in_mm(client, size):
             pane = pane_of(page, title)
             playwright.expect(pane).to_be_visible()
             assert in_time(page, lambda: "".join(pane.locator(".slice-side").all_inner_texts()) == letters)  # noqa: B023
-            # The row of tools breaks into two once the window's words are in it: the panes change their size, one by one.
-            assert in_time(page, lambda: pixels_per_mm(pane) == pytest.approx(pixels_per_mm(pane_of(page, "Axial"))))  # noqa: B023
+            # The row of tools breaks into two once the window's words are in it: the panes change their size.
+            axial = pane_of(page, "Axial")
+            assert in_time(page, lambda: pixels_per_mm(pane) == pytest.approx(pixels_per_mm(axial)))  # noqa: B023
         follow_the_cross_hair(page)
         measure(page)
         seed_and_crop(client, page, name)

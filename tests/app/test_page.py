@@ -796,10 +796,13 @@ def test_flows_of_other_settings_are_not_taken_for_those_of_the_results(flown, t
             keep_flow(folder, told["input"]["sha256"], other, "bare")
         view = client.get(case).json()
         assert not view["has_flow"]
-        assert (view["steps"]["flow"], view["steps"]["report"]) == ("todo", "done")
+        assert (view["steps"]["flow"], view["steps"]["report"]) == ("stale", "stale")
+        (listed,) = client.get("/api/cases").json()["cases"]
+        assert (listed["done"], listed["kept"]) == (list(STEPS[:5]), list(STEPS))
         assert "Run the step Flow" in client.get(f"{case}/flow").json()["detail"]
         (folder / "report.html").unlink()
-        assert client.get(case).json()["steps"]["report"] == "todo"
+        steps = client.get(case).json()["steps"]
+        assert (steps["flow"], steps["report"]) == ("todo", "todo")
     (folder / "app.json").unlink()
     with app_case.served(tmp_path / "others", folder) as client:
         (listed,) = client.get("/api/cases").json()["cases"]

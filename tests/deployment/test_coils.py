@@ -239,7 +239,7 @@ def test_given_coils_are_placed_in_their_order_with_their_loops_and_lengths():
     assert [one.coil_label for one in done.stent.coils] == ["4.5 mm x 3 cm", "2 mm x 1.5 cm"]
     assert done.stent.wire_length_mm == pytest.approx(45, abs=WOUND_MM)
     assert (done.outcome, "2 coils (4.5 mm x 3 cm, 2 mm x 1.5 cm)" in done.advice) == ("terminated", True)
-    assert measure_coils(SAC, done.stent)["size"] == "4.5 mm x 4.5 cm"
+    assert measure_coils(SAC, done.stent)["size"] == f"{done.stent.density_fraction:.0%}"
 
 
 def test_what_does_not_fit_is_refused():

@@ -139,7 +139,7 @@ export class SectionChart {
   }
 }
 
-/** Convergence error of a flow at every check, on a logarithmic scale. */
+/** Convergence error of a flow at its checks, one after the other, on a logarithmic scale. */
 export function residualChart(points, tolerance = 0.01) {
   const [width, height, left, bottom, top] = [360, 150, 44, 22, 22];
   const x = (f) => left + (width - left - 8) * f;
@@ -147,11 +147,10 @@ export function residualChart(points, tolerance = 0.01) {
   const y = (v) => top + ((height - top - bottom) * (0 - Math.log10(Math.min(Math.max(v, 0.004), 1)))) / (0 - low);
   const parts = [1, 0.1, 0.01].flatMap((v) => level(y(v), left, width - 8, `${100 * v} %`, v === tolerance ? "goal" : "grid"));
   parts.push(text(4, 13, "Convergence error", { class: "axis-title" }), text(width - 8, 13, "goal 1 %", { class: "axis-title end" }));
-  parts.push(text(x(0), height - 6, "start", { class: "tick" }), text(x(1), height - 6, "done", { class: "tick end" }));
+  parts.push(text(x(0), height - 6, "start", { class: "tick" }), text(x(1), height - 6, "now", { class: "tick end" }));
   if (points.length) {
-    parts.push(svg("path", { d: path(points.map(([f, v]) => [x(f), y(v)])), class: "line device" }));
-    const [f, v] = points.at(-1);
-    parts.push(svg("circle", { cx: x(f), cy: y(v), r: 3.5, class: "dot" }));
+    parts.push(svg("path", { d: path(points.map(([, v], i) => [x(i / Math.max(points.length - 1, 1)), y(v)])), class: "line device" }));
+    parts.push(svg("circle", { cx: x(points.length > 1), cy: y(points.at(-1)[1]), r: 3.5, class: "dot" }));
   }
   return svg("svg", { class: "chart small", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": "Residual" }, parts);
 }
@@ -164,7 +163,7 @@ export function pulseChart({ time_s, factor }, isPulsatile, times, moment, chose
   const y = (f) => height - bottom - ((height - top - bottom) * f) / high;
   const parts = [0, 1].flatMap((v) => level(y(v), left, width - 8, String(v), v ? "goal" : "grid"));
   const shown = moment !== undefined && times.length ? `shown: ${times[moment].toFixed(2)} s` : times.length ? "shown: the cycle's mean" : isPulsatile ? "pulsatile" : "steady, at the mean";
-  parts.push(text(0, 12, "Inflow / mean", { class: "axis-title" }), text(width - 34, 13, shown, { class: "axis-title end" }));
+  parts.push(text(0, 12, "Inflow / mean", { class: "axis-title" }), text(width - 42, 12, shown, { class: "axis-title end" }));
   for (const t of ticks(0, time_s.at(-1), 4)) parts.push(text(x(t), height - 8, `${t} s`, { class: "tick middle" }));
   parts.push(svg("path", { d: path(time_s.map((t, i) => [x(t), y(factor[i])])), class: isPulsatile ? "line device" : "line artery" }));
   const at = (t) => factor[Math.round((t / time_s.at(-1)) * (factor.length - 1))];

@@ -15,7 +15,7 @@ export class Deploying {
     this.name = this.id = null; // of the treatment, and of the implant in it
     this.place = null;
     this.sketches = new Newest((answer) => this.sketched(answer), page.complain);
-    this.whole = new Newest((answer) => this.deployed(answer), page.complain);
+    this.whole = new Newest((answer) => this.deployed(answer), ({ message }) => page.show({ undeployed: message })); // why no device is seen
     this.bands = new Newest((sheet) => !this.isDragging && page.toldBands(sheet), page.complain);
     this.gaps = new Newest((sheet) => sheet && !this.isDragging && page.toldBands(sheet), page.complain); // the bands with those of gaps
     this.sections = new Newest((answer) => page.section.show(answer), () => {});
@@ -82,6 +82,7 @@ export class Deploying {
     if (name !== this.name || id !== this.id) this.page.along.set({ device: null });
     [this.name, this.id] = [name, id];
     const wanted = { ...this.wantedNow(), colour: this.page.colour };
+    this.page.undeployed = "";
     this.whole.ask(() => postBinary(`${this.page.path}/deployment`, wanted));
   }
 

@@ -120,10 +120,10 @@ export class Flowing {
 
   draw(history) {
     const low = Math.min(-10, ...history);
-    const [x, y] = [(i) => 30 + (206 * i) / Math.max(history.length - 1, 1), (v) => 6 + (52 * v) / low];
+    const [x, y] = [(i) => 44 + (192 * i) / Math.max(history.length - 1, 1), (v) => 6 + (52 * v) / low];
     const line = history.map((v, i) => `${i ? "L" : "M"}${x(i).toFixed(1)} ${y(Math.min(v, 0)).toFixed(1)}`).join("");
-    const word = (v) => svg("text", { x: 26, y: y(v) + 4, class: "tick end" }, [`${v.toFixed(0).replace("-", "−")} %`]);
-    const parts = [0, low].map((v) => svg("line", { x1: 30, x2: 236, y1: y(v), y2: y(v), class: "grid" }));
+    const word = (v) => svg("text", { x: 40, y: y(v) + 4, class: "tick end" }, [`${v.toFixed(0).replace("-", "−")} %`]);
+    const parts = [0, low].map((v) => svg("line", { x1: 44, x2: 236, y1: y(v), y2: y(v), class: "grid" }));
     this.chart.replaceChildren(...parts, word(0), word(low), svg("path", { d: line, class: "line device" }));
   }
 }

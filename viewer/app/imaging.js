@@ -15,7 +15,7 @@ export class Imaging {
     this.box = make("div", { className: "slices", hidden: true });
     this.surfaces = new Newest(
       (answer) => {
-        page.picture.put(answer);
+        page.picture.put({ ...answer, manifest: { ...answer.manifest, is_oriented: page.scan.is_oriented } });
         if (this.views?.length) return;
         this.views = answer.manifest.views;
         page.renderScene();

@@ -47,7 +47,6 @@ class Page {
     this.isFollowing = false; // along the steps of the job that runs
     this.isWhole = false;
     addEventListener("keydown", (event) => this.key(event));
-    addEventListener("hashchange", () => this.route());
     this.begin();
   }
 
@@ -60,6 +59,7 @@ class Page {
       const { opened } = await get("/api/cases").catch(() => ({})); // the list of cases asks again
       if (opened) history.replaceState(null, "", `#${opened}`);
     }
+    addEventListener("hashchange", () => this.route()); // not before the devices have their names
     this.route();
   }
 
@@ -478,7 +478,7 @@ class Page {
     if (!treatment || this.asksForAneurysm) return;
     this.picture.moved = (event) => this.deploying.look(this.deploying.line.under(event, null));
     const key = JSON.stringify([treatment, implant.id, this.colour, this.view.anatomy, this.view.choices.straightening, this.view.job?.kind === "place"]);
-    if (this.shownTreatment !== key || !this.measures[treatment.name]) {
+    if (this.shownTreatment !== key || !(this.measures[treatment.name] || this.undeployed)) {
       this.shownTreatment = key;
       this.deploying.show(treatment.name, implant.id);
     }
@@ -534,7 +534,7 @@ class Page {
     const parts = [];
     const flow = this.sheets?.flow?.[0];
     if (["flow", "report"].includes(this.step) && flow) {
-      const stale = this.view.steps.flow === "stale" ? [make("p", { className: "note stale" }, ["Settings have changed since this flow was computed: run the step Flow again."])] : [];
+      const stale = this.view.steps.flow === "stale" ? [make("p", { className: "note stale" }, ["These numbers are of an earlier flow: run the step Flow again."])] : [];
       const both = [changeSheet(flow, this.isWhole, (name) => this.names.treatment(name)), qualitySheet(flow)];
       parts.push(head("Before and after"), ...stale, ...(flow.qualities.some(({ grade }) => grade === "not usable") ? both.reverse() : both));
       if (this.sheets.ranking?.length) parts.push(...rankedSheet(this.sheets.ranking, (name) => this.names.treatment(name)));
@@ -544,7 +544,7 @@ class Page {
       const isFirst = (one) => one === this.treatment && this.names.isFor(one.implants[0].device, "basket"); // others differ in their rows
       const sheets = [...this.view.choices.treatments].sort((a, b) => isFirst(b) - isFirst(a)).flatMap(({ name }) => this.measures[name] || []);
       const [alike, others] = [true, false].map((isAlike) => sheets.filter(({ rows }) => (rows[0].key === sheets[0].rows[0].key) === isAlike));
-      if (sheets.length) parts.push(head("Deployed"), plainSheet(alike, this.isWhole));
+      if (sheets.length) parts.push(head("Deployed"), plainSheet(alike, this.isWhole, sheets.length > 1));
       for (const sheet of others.filter(({ rows }) => this.isWhole || rows.some((row) => row.is_first))) parts.push(make("h3", {}, [sheet.title]), plainSheet([sheet], this.isWhole));
     }
     if (this.step === "report") for (const varied of this.sheets?.uncertainty || []) parts.push(...sureSheet(varied));

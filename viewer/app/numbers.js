@@ -9,10 +9,10 @@ function term({ name, meaning, source }) {
 /** Whether a value says that a device does not span the neck. */
 const isMissed = ({ key }, value) => key === "neck_covered_fraction" && !value.startsWith("100");
 
-/** Numbers with one value, or one per sheet side by side. */
-export function plainSheet(sheets, isWhole) {
+/** Numbers with one value, or one per sheet side by side, with the titles of the sheets where there are several. */
+export function plainSheet(sheets, isWhole, hasHead = sheets.length > 1) {
   const rows = sheets[0].rows.filter((row) => isWhole || row.is_first);
-  const head = sheets.length > 1 ? [make("div", { className: "row head" }, [make("span"), ...sheets.map(({ title }) => make("b", {}, [title]))])] : [];
+  const head = hasHead ? [make("div", { className: "row head" }, [make("span"), ...sheets.map(({ title }) => make("b", {}, [title]))])] : [];
   const lines = rows.map((row) => {
     const values = sheets.map((sheet) => sheet.rows.find(({ key }) => key === row.key)?.cells[0] ?? "–");
     return make("div", { className: "row" }, [term(row), ...values.map((value) => make("b", { className: isMissed(row, value) ? "bad" : "" }, [value]))]);
@@ -67,6 +67,9 @@ function span(low, high) {
   return unit && high.endsWith(unit) ? `${digits} to ${high}` : `${low} to ${high}`;
 }
 
+/** A band, and what causes most of it. */
+const banded = (low, high, cause) => `${span(low, high)}${cause ? `, mostly from ${cause}` : ""}`;
+
 /** Uncertainty of the results of a device: mean, 95 % interval and main causes. */
 export function sureSheet({ title, words, rows }) {
   const cause = (shares) => shares.filter(([, share]) => share >= 0.05).map(([name, share]) => `${name} ${Math.round(100 * share)} %`).join(", ");
@@ -99,7 +102,7 @@ export function placeWords({ length_mm, width_mm, ends_mm, is_basket, is_coils, 
   const reach = (name, i) => [name, reachWords(i, ends_mm[i], neck ?? neckOfParent), "", reachOf(i, ends_mm[i], neck ?? neckOfParent) < 0];
   const rows = is_basket
     ? [["Width × height", `${width_mm.toFixed(1)} × ${length_mm.toFixed(1)} mm`, ""], ["Lower end", heightWords(ends_mm[0]), ""]]
-    : [["Deployed length", `${length_mm.toFixed(1)} mm`, low ? `${span(low, high)}${cause ? `: ${cause}` : ""}` : ""], reach("Proximal end", 0), reach("Distal end", 1)];
+    : [["Deployed length", `${length_mm.toFixed(1)} mm`, low ? banded(low, high, cause) : ""], reach("Proximal end", 0), reach("Distal end", 1)];
   return rows.map(([name, value, range, isShort]) => make("div", { className: "row" }, [make("span", {}, [name]), make("b", { className: isShort ? "bad" : "" }, [value]), make("small", {}, [range])]));
 }
 
@@ -107,7 +110,7 @@ export function placeWords({ length_mm, width_mm, ends_mm, is_basket, is_coils, 
 export function bandWords(sheet) {
   if (!sheet) return [];
   const rows = sheet.rows.map(([name, value, low, high, cause]) =>
-    make("div", { className: "row" }, [make("span", {}, [name]), make("b", {}, [value]), make("small", {}, [`${span(low, high)}${cause ? `: ${cause}` : ""}`])]),
+    make("div", { className: "row" }, [make("span", {}, [name]), make("b", {}, [value]), make("small", {}, [banded(low, high, cause)])]),
   );
   const details = make("details", {}, [make("summary", {}, ["Bands from the ranges of the device's numbers"]), ...rows]);
   return [make("p", { className: "hint" }, [sheet.sentence]), ...(rows.length ? [details] : [])];
@@ -117,5 +120,5 @@ export function bandWords(sheet) {
 export function neckWords(neck, found) {
   const row = (name, value, was) => make("div", { className: "row" }, [make("span", {}, [name]), make("b", {}, [value]), make("small", {}, [value === was ? "" : `of the vessel shown: ${was}`])]);
   const [area, around] = [(x) => `${x.area_mm2.toFixed(1)} mm²`, (x) => `${x.perimeter_mm.toFixed(1)} mm`];
-  return [row("Neck curve, projected area", area(neck), area(found)), row("Neck perimeter", around(neck), around(found))];
+  return [row("Neck curve, projected area", area(neck), area(found)), row("Neck curve, length", around(neck), around(found))];
 }

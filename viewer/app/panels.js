@@ -19,8 +19,9 @@ const link = (words, act) => button(words, act, { className: "link" });
 
 /** What keeps a step from being done: its failure, a change since it was done; and the button that finds the vessel. */
 function state(page) {
-  const { failed, steps, job, has_anatomy, wants_grid } = page.view;
-  const words = page.step === "image" ? "You have changed a setting since this vessel was found." : "You have changed an earlier step. What you see was computed before the change.";
+  const { failed, steps, job, has_anatomy, has_flow, wants_grid } = page.view;
+  const isLost = ["flow", "report"].includes(page.step) && !has_flow;
+  const words = isLost ? "The stored flow is missing, or of another version of vstent: run the flow again." : page.step === "image" ? "You have changed a setting since this vessel was found." : "You have changed an earlier step. What you see was computed before the change.";
   const isCurrent = ["image", "vessel", "sac"].every((step) => steps[step] === "done");
   const isFound = ["image", "vessel", "sac"].includes(page.step) && !job && !isCurrent && !wants_grid && !page.asksForAneurysm;
   return [
@@ -59,7 +60,8 @@ function unseen(page) {
 
 const main = (words, act, disabled = false) => button(words, act, { className: "primary wide", disabled });
 
-const next = (page, step, words, isMain = false) => button(words, () => page.go(step), { className: `wide next ${isMain ? "primary" : ""}` });
+/** The way to another step: filled where nothing else is to be done first. */
+const next = (page, step, words) => button(words, () => page.go(step), { className: "wide next" });
 
 /** An input or a list with its label and unit; `key` finds it again when it is drawn anew. */
 function field(key, label, unit, input, className = "field") {
@@ -119,9 +121,9 @@ function point(page, key, label) {
 /** The least value of a setting of the flow, as the server states it. */
 const leastOf = ({ fields }, key) => fields[key]?.minimum ?? fields[key]?.exclusiveMinimum;
 
-/** How an outlet condition is called where its name in the settings does not say it. */
 /** What is known of how much devices straighten arteries; others are stated on the command line. */
 const STRAIGHTENINGS = [["off", "rigid"], ["immediate", "straightened at implantation"], ["six_months", "straightened after six months"]];
+/** How an outlet condition is called where its name in the settings does not say it. */
 const OUTLETS = { murray: "split by r³ (Murray)" };
 
 export const panels = {
@@ -148,7 +150,8 @@ export const panels = {
   },
 
   sac(page) {
-    const parts = page.asksForAneurysm ? title("Sac and parent", "No device is proposed or deployed until you have said where the aneurysm is.") : [...title("Sac and parent", "The sac (red) is taken off along its neck; the artery beneath it (sand) is what a device opens against. Drag the points on the neck to draw it anew; click a sac to choose it.")];
+    const lead = page.view.choices.without_aneurysm ? "A device opens against the parent artery (sand)." : "The sac (red) is taken off along its neck; the artery beneath it (sand) is what a device opens against. Drag the points on the neck to draw it anew; click a sac to choose it.";
+    const parts = title("Sac and parent", page.asksForAneurysm ? "No device is proposed or deployed until you have said where the aneurysm is." : lead);
     if (page.asksForAneurysm) parts.push(question(page));
     if (page.view.choices.without_aneurysm) parts.push(make("div", { className: "given" }, [make("span", {}, ["The artery has no aneurysm."]), link("Ask again", () => page.choose({ without_aneurysm: false }))]));
     if (page.anatomy) parts.push(parentOutlet(page));
@@ -169,7 +172,7 @@ export const panels = {
     parts.push(...catalogueParts(page));
     const isRanked = chosen.some(({ implants }) => implants.some(({ device }) => page.names.isStent(device)));
     parts.push(...state(page), ...(isRanked ? flowsOfRanking(page) : []));
-    if (!job) parts.push(main(has_ranking ? "Rank all sizes again" : "Rank all sizes", () => page.start("rank"), !page.view.has_anatomy || !isRanked));
+    if (!job) parts.push(button(has_ranking ? "Rank all sizes again" : "Rank all sizes", () => page.start("rank"), { className: "wide", disabled: !page.view.has_anatomy || !isRanked }));
     if (chosen.length && !isRanked) parts.push(make("p", { className: "hint" }, ["Sizes of baskets and coils are not ranked."]));
     parts.push(next(page, "deploy", "Deploy →"));
     return parts;
@@ -187,7 +190,7 @@ export const panels = {
     if (page.missing === treatment.name && !page.view.job) parts.push(main("Place the coils", () => page.start("place"), !page.view.has_anatomy));
     const colour = "Colour of the wires";
     parts.push(
-      make("div", { className: "place" }, isHere(page.place) ? placeWords(page.place, isHere(page.bands) ? page.bands : null, page.anatomy.neck) : [make("p", { className: "hint", role: "status" }, ["The device is being deployed …"])]),
+      make("div", { className: "place" }, page.undeployed ? [make("p", { className: "note failed", role: "alert" }, [page.undeployed])] : isHere(page.place) ? placeWords(page.place, isHere(page.bands) ? page.bands : null, page.anatomy.neck) : [make("p", { className: "hint", role: "status" }, ["The device is being deployed …"])]),
       select("straightening", "Artery", page.view.choices.straightening, STRAIGHTENINGS, (value) => page.choose({ straightening: value })),
       make("p", { className: "hint yielding" }, [isHere(page.place) ? (page.place.straightening ?? "") : ""]),
       make("div", { className: "bands" }, isHere(page.bands) ? bandWords(page.bands) : []),
@@ -197,7 +200,7 @@ export const panels = {
     );
     if (page.anatomy?.neck?.length) parts.push(page.flowing.element);
     parts.push(make("p", { className: "advice" }, [page.advice && isHere(page.place) ? page.advice : ""]), ...state(page));
-    parts.push(make("a", { className: "button wide", href: `${page.path}/plan.pdf`, target: "_blank", rel: "noopener" }, ["One-page plan (PDF)"]));
+    parts.push(make("a", { className: "button wide", href: `${page.path}/plan.pdf`, target: "_blank", rel: "noopener" }, ["Plan to print (PDF)"]));
     parts.push(next(page, "flow", "Flow →"));
     return parts;
   },
@@ -222,7 +225,7 @@ export const panels = {
     if (!job && isDone) parts.push(button("Run again", run, { className: "wide", disabled: !page.treatment }));
     else if (!job) parts.push(main("Run the flow", run, !page.view.has_anatomy || !page.treatment));
     if (page.flowPanes?.length) parts.push(modes(page), ...depth(page), ...films(page));
-    if (page.view.has_report && steps.report === "done") parts.push(next(page, "report", "Report →", true));
+    if (page.view.has_report && steps.report === "done") parts.push(next(page, "report", "Report →"));
     return parts;
   },
 
@@ -238,7 +241,7 @@ export const panels = {
       const options = [["", "off"], ...[16, 32, 64].map((n) => [String(n), `${n} deployments`])];
       const asked = (count) => page.choose({ uncertainty_samples: count ? Number(count) : null });
       parts.push(select("sure", "Uncertainty", choices.uncertainty_samples ?? "", options, asked));
-      parts.push(make("p", { className: "hint" }, ["Deploys every device many times with varied threshold, landing and device diameter. The report then shows a 95 % interval for each result and its main causes. Baskets and treatments of several devices are not varied."]));
+      parts.push(make("p", { className: "hint" }, ["Deploys every device many times with varied threshold, landing and device diameter. The report then shows a 95 % interval for each result and its main causes. Baskets are not varied, and of several devices only a stent with coils is."]));
       if (steps.report !== "done" && steps.flow === "done" && !job) parts.push(main("Write the report again", () => page.start("flow")));
     }
     if (steps.flow !== "done" && job?.kind !== "angiogram") {
@@ -252,10 +255,10 @@ export const panels = {
 /** How many of the best sizes get a flow when they are ranked. */
 function flowsOfRanking(page) {
   if (!page.anatomy?.neck?.length) return [];
-  const options = [["", "none"], ...[2, 4, 6, 12].map((n) => [String(n), `the best ${n}`])];
+  const options = [["", "no size"], ...[2, 4, 6, 12].map((n) => [String(n), `the best ${n} sizes`])];
   const hint = "The best size of each device is among them. The changes of neck inflow, sac velocity and wall shear stress join the table. Finished flows are kept: a cancelled ranking goes on when it is started again.";
   return [
-    select("rank-flows", "Flows", page.view.choices.ranking_flows ?? "", options, (count) => page.choose({ ranking_flows: count ? Number(count) : null })),
+    select("rank-flows", "Flow of", page.view.choices.ranking_flows ?? "", options, (count) => page.choose({ ranking_flows: count ? Number(count) : null })),
     ...(page.view.choices.ranking_flows ? [make("p", { className: "hint" }, [hint])] : []),
   ];
 }
@@ -270,7 +273,7 @@ function grid(page) {
     else page.tell("Give three numbers, or one for all three.", "problem");
   };
   return [
-    make("p", { className: "hint" }, ["These voxels have no header: it must be said how many and how large they are, the one that runs fastest first."]),
+    make("p", { className: "hint" }, ["This file has no header. Give the number and the spacing of its voxels along x, y and z; x runs fastest."]),
     words("shape", "Voxels", "", shape, "256 256 256", chosen("shape", (n) => Number.isInteger(n) && n > 0)),
     words("spacing_mm", "Spacing", "mm", spacing_mm, "0.3 0.3 0.3", chosen("spacing_mm", (mm) => mm > 0)),
   ];
@@ -454,7 +457,7 @@ function treatmentRows(page, treatment) {
     ];
     return make("div", { className: "implant" }, [make("span", {}, [page.names.implant(name, id), " ", make("small", {}, [sizeWords(page, implant)])]), ...(canChange ? acts : [])]);
   };
-  const head = make("label", { className: "device", title: `Treatment ${name}` }, [treatmentTick(page, name, treatment, true), make("span", {}, [make("b", {}, [page.names.treatment(name)])])]);
+  const head = make("label", { className: "device", title: `In files and commands: ${name}` }, [treatmentTick(page, name, treatment, true), make("span", {}, [make("b", {}, [page.names.treatment(name)])])]);
   return [head, ...implants.map(row), ...joining(page, treatment), ...adding(page, treatment)];
 }
 

@@ -136,8 +136,9 @@ export class Picture {
         const chip = button(title, turn, { className: "chip", ariaPressed: String(this.shown.has(id)) });
         return chip;
       });
-    const views = this.views.map(({ id }, i) => button(VIEWS[id][0], () => this.look(id), { className: "chip view", title: `${VIEWS[id][1]} (key ${i + 1})` }));
-    const own = this.stage && this.views.length ? [...this.savedViews.map((view) => this.keptChip(view)), this.keepChip(), ...(this.stage.isOriented === false ? [] : [this.carm])] : [];
+    const isOriented = this.stage?.isOriented !== false; // without it no side of the patient is known
+    const views = this.views.map(({ id }, i) => isOriented || !["frontal", "lateral"].includes(id) ? button(VIEWS[id][0], () => this.look(id), { className: "chip view", title: `${VIEWS[id][1]} (key ${i + 1})` }) : "");
+    const own = this.stage && this.views.length ? [...this.savedViews.map((view) => this.keptChip(view)), this.keepChip(), ...(isOriented ? [this.carm] : [])] : [];
     const save = this.stage ? [this.save] : [];
     redraw(this.toolbar, make("div", { className: "chips" }, layers), make("div", { className: "chips" }, [...views, ...own, ...save]));
     this.makeRoom();

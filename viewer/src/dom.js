@@ -7,7 +7,7 @@ export const spoken = (words) =>
     .replace(/\b((?:in|out)let)_(?=\d)/g, "$1 ")
     .replaceAll("+-", "±")
     .replace(/(^|[^\w.–-])-(?=\d)/g, "$1−")
-    .replace(/(\d) x (?=\d)/g, "$1 × ")
+    .replace(/(\d|\d mm) x (?=\d)/g, "$1 × ")
     .replace(/(\d)%/g, "$1\u202f%");
 
 /** An element with properties (role and aria... become attributes, `style` and `data` are objects) and children. */

@@ -140,15 +140,17 @@ def failures(state: State) -> dict[str, str]:
 def statuses(state: State, at_work: str, lost: Set[str]) -> dict[str, Status]:
     """Return the status of every step."""
     keys, failed = dependencies(state), failures(state)
+    # A report without its flows, as after an update of vstent, is as old as they are.
+    old = {"flow", "report"} if "flow" in lost and "report" not in lost else set()
 
     def status(step: str) -> Status:
         if step == at_work:
             return "running"
         if step in failed:
             return "failed"
-        if step not in state.done or step in lost:
+        if step not in state.done or step in lost - old:
             return "todo"
-        return "done" if state.done[step] == keys[step] else "stale"
+        return "done" if state.done[step] == keys[step] and step not in old else "stale"
 
     return {step: status(step) for step in STEPS}
 

@@ -71,7 +71,7 @@ class Workspace:
                     "id": case_id,
                     "name": case.state.name,
                     "done": [step for step in STEPS if steps[step] == "done"],
-                    "kept": [step for step in STEPS if step in case.state.done and step not in lost],
+                    "kept": [step for step in STEPS if steps[step] in ("done", "stale")],
                     "job": job.kind if job else "",
                     "failed": [step for step in STEPS if steps[step] == "failed"],
                     "changed_s": changed_s,
@@ -402,10 +402,13 @@ def pulse(case: Case | None) -> dict[str, Any]:
 
 def _titles(metrics: dict[str, Any], case: Case) -> dict[str, str]:
     """Return the titles of the treatments, devices with their sizes, in the order in which they were chosen."""
-    order = [treatment.name for treatment in case.state.choices.treatments]
-    found = {name: one["implants"].values() for name, one in metrics["treatments"].items() if name != BARE}
-    names = sorted(found, key=lambda name: order.index(name) if name in order else len(order))
-    return {name: " + ".join(f"{one['device']} {one['size']}" for one in found[name]) for name in names}
+    chosen = {one.name: [implant.id for implant in one.implants] for one in case.state.choices.treatments}
+    titles = {}
+    for name in sorted(sorted(metrics["treatments"].keys() - {BARE}), key=lambda name: [*chosen, name].index(name)):
+        implants = metrics["treatments"][name]["implants"]
+        ordered = sorted(implants, key=lambda key: [*chosen.get(name, ()), key].index(key))
+        titles[name] = " + ".join(f"{implants[key]['device']} {implants[key]['size']}" for key in ordered)
+    return titles
 
 
 def _is_surface(case: Case) -> bool:

@@ -398,7 +398,7 @@ def measure_coils(anatomy: Anatomy, coils: Coils) -> Measures:
     radius_mm = bend_radii_mm(coils.wire_points_mm, coils.wire_starts)
     found: Measures = {
         "device": coils.design.name,
-        "size": coils.size.coil_label,
+        "size": f"{coils.density_fraction:.0%}",
         "coils": ", ".join(one.coil_label for one in coils.coils),
         "coils_count": float(len(coils.coils)),
         "coil_length_mm": coils.wire_length_mm,

@@ -284,7 +284,7 @@ def _aside(axis_mm: Floats, path: Path, other: Path) -> Floats:
     foot_mm, away_mm = curves.project(other.axis.points_mm, axis_mm)
     is_parted = away_mm > PARTED_MM
     if not is_parted.any() or is_parted[0]:
-        raise LandingError(f"The paths {path.name} and {other.name} do not run side by side from the inlet to a fork.")
+        raise LandingError(f"Paths {path.name} and {other.name} do not run side by side to a fork: choose others.")
     parted = int(is_parted.argmax())
     radius_mm = np.interp(
         np.linspace(0.0, path.axis.length_mm, len(axis_mm)), path.axis.abscissa_mm, path.section_radius_mm

@@ -141,7 +141,7 @@ class Numerics:
         metavar="WORD",
     )
     """How the embedded engine takes the wires over necks and ostia: as media, or as walls on as many finer levels as
-    they need for four cells across. Coarser levels have the media where wires are too thin for them."""
+    they need for two to four cells across. Coarser levels have the media where wires are too thin for them."""
     cells_per_diameter: float = 29.0
     """Number of cells across the mean (hydraulic) diameter 4 V / A of the vessel, where no grid spacing is given."""
     cell_budget: float = 480_000.0

@@ -30,6 +30,8 @@ PATIENT_PX = (420, 320)
 """Width and height of the picture of one patient in a cohort, in pixels."""
 SEEN_GAP_MM = 0.1
 """Gap in mm from which a contour is shown from the side of its largest gap."""
+COIL_MM = 0.1
+"""Radius in mm that is larger than of all wires and struts, and smaller than of all coils."""
 WEBP_QUALITY = 90
 """Quality of the pictures in the HTML report, 0 to 100, as defined by Pillow's WebP writer."""
 WEBP_METHOD = 2
@@ -138,8 +140,8 @@ def plates(scene: Scene) -> list[Plate]:
             "and those at less than 45° (laser-cut closed cells) on the outer side."
         )
         wires = (
-            "The wires and the neck (red line), seen from the sac with its wall removed; wires on the far side are "
-            "paler."
+            "The wires and the neck (red line), seen from the sac without its wall and coils. "
+            "Wires on the far side are paler."
         )
         shots = [
             Shot(f"{title}: {shot.title.lower()}", shot.layers, shot.view)
@@ -185,8 +187,16 @@ def wire_shots(scene: Scene, pane: str, *more: str) -> list[Shot]:
         "neck": ("Seen from the sac", ("wires", "neck")),
     }
     return [
-        Shot(looks[view.id][0], scene.pick(looks[view.id][1], pane), view) for view in scene.views if view.id in looks
+        Shot(looks[view.id][0], _without_coils(scene.pick(looks[view.id][1], pane), view), view)
+        for view in scene.views
+        if view.id in looks
     ]
+
+
+def _without_coils(layers: tuple[MeshLayer | LineLayer, ...], view: View) -> tuple[MeshLayer | LineLayer, ...]:
+    """Return layers without coils where these would hide a stent that is seen from the sac."""
+    thin = tuple(one for one in layers if not (isinstance(one, LineLayer) and one.radius_mm.max() > COIL_MM))
+    return thin if view.id == "neck" and any(one.id == "wires" for one in thin) else layers
 
 
 def patient_picture(anatomy: Anatomy, deployments: Sequence[Deployment]) -> Picture:
@@ -252,15 +262,16 @@ def _contours(scene: Scene, meshes: Sequence[tuple[str, str]]) -> Plate:
     """Return the picture of the deployed contours in these panes, colored by their gap to the wall."""
     shots = []
     for pane, title in meshes:
-        contour = next(layer for layer in scene.pick(("contour",), pane) if isinstance(layer, MeshLayer))
+        contours = [layer for layer in scene.pick(("contour",), pane) if isinstance(layer, MeshLayer)]
+        contour = max(contours, key=lambda one: float(one.values.max()))
         largest_mm = float(contour.values.max())
         profile, is_seen = scene.view("profile"), largest_mm >= SEEN_GAP_MM
-        words = f"gap of {largest_mm:.2f} mm" if is_seen else f"gaps below {SEEN_GAP_MM:g} mm"
+        words = f"gap up to {largest_mm:.2f} mm" if is_seen else f"gaps below {SEEN_GAP_MM:g} mm"
         view = gap_view(contour, profile) if is_seen else profile
         shots.append(Shot(f"{title}: {words}", scene.pick(("lumen", "continued", "contour", "neck"), pane), view))
     caption = (
-        "The deployed contour in the lumen, colored by its gap to the wall of the parent artery and seen from the side "
-        "where the gap is largest."
+        "The deployed contour in the lumen, colored by its gap to the wall of the parent artery, over the neck too, "
+        "and seen from the side where the gap is largest."
     )
     return Plate("contour", "Position of the devices", caption, scene, shots, "wall_gap")
 

@@ -261,7 +261,7 @@ def _expansion(name: str, number: int, deployed: Mapping[str, Deployment], anato
     gap = scene.scale("wall_gap")
     wide = replace(gap, high=round_up(max(gap.high, float(np.percentile(gaps_mm[0], 98)))))
     shown = replace(scene, scales=tuple(wide if scale is gap else scale for scale in scene.scales))
-    title = f"Expansion of {implant_titles(deployed, f'{name}: ')[key]}"
+    title = f"Expansion of {implant_titles(deployed)[key]}"
     caption = "Expansion of the active contour to the wall of the parent artery (glass), colored by the remaining gap."
     plate = f"expansion-{name}" if number == 0 else f"expansion-{name}-{number + 1}"
     return Plate(plate, title, caption, shown, shots, "wall_gap")

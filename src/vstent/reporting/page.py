@@ -177,6 +177,9 @@ def contents_of(case: "CaseResult", drawing: Drawing | None = None) -> Contents:
     for name, deployed in case.implants.items():
         if len(deployed) > 1 and (measured := metrics["treatments"][name].get("together")):
             implants.append(_together(f"{treatment_title(deployed)}, together", measured, name))
+    flows = {f"Flow, {name}": f"Flow with {title}" for name, title in scene.panes}
+    flows[f"Flow, {BARE}"] = "Flow without a device"
+    noted = (note.partition(":") for note in case.notes)
     return Contents(
         name=case.name,
         metrics=metrics,
@@ -187,7 +190,7 @@ def contents_of(case: "CaseResult", drawing: Drawing | None = None) -> Contents:
         implants=implants,
         openings=opening_rows(case.anatomy.vessel.openings),
         is_pulse=any(field.phases for field in case.fields.values()),
-        notes=tuple(note.replace(f"Flow, {BARE}:", "Flow without a device:") for note in case.notes),
+        notes=tuple(flows.get(head, head) + colon + rest for head, colon, rest in noted),
         limits=limits_of(case),
         provenance=_provenance(case.provenance),
         origin=_origin(case.provenance.get("input", {})),
@@ -333,7 +336,7 @@ def _plain(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return f"{value:.4g}"
+        return np.format_float_positional(value, 4, fractional=False, trim="-")
     if isinstance(value, str) and re.fullmatch(r"[a-z]+(_[a-z]+)+", value):
         return value.replace("_", " ")
     if isinstance(value, (list, tuple)):

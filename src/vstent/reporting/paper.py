@@ -2,7 +2,7 @@
 
 import io
 import textwrap
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -20,12 +20,16 @@ INK, QUIET, ACCENT, LINE, WARN = "#16262e", "#54666f", "#0b6473", "#d7dfe3", "#8
 """Colors of text, secondary text, headings, rules and the statement at the foot."""
 _CHARACTER: Final = 0.53
 """Mean width of a character as a fraction of the font size, for line breaks."""
+BOLD: Final = 1.1
+"""Width of bold text in that of regular text."""
 BESIDE_IN: Final = 0.25
 """Distance in inches between two columns of names and values."""
 AROUND: Final = 1.15
 """Height of the title and caption of a picture in inches."""
 SMALLEST: Final = 0.45
 """Smallest size of a picture that then fits on the current page, as a fraction of its usual one."""
+SCALES: Final = (1.0, 0.92, 0.84, 0.77, 0.7)
+"""Scales of a page that is to hold all of something, the largest first. Text has 8 points at scale 1."""
 BADGE: Final = "Research use only. Not a medical device."
 """Statement at the foot of every page."""
 
@@ -97,16 +101,21 @@ class Paper:
     def title(self, words: str) -> None:
         """Write the title of the report."""
         self._put(LEFT, self._y, "vstent", 10, color=ACCENT, weight="bold")
-        self._y -= 0.36
-        self._put(LEFT, self._y, words, 18, weight="bold")
+        self._lines(words, 18, 0.36, INK)
         self._y -= 0.20
 
     def heading(self, words: str) -> None:
         """Write a heading; it starts a new page where the current one has no space for text below it."""
         self.room(1.2)
-        self._y -= 0.38
-        self._put(LEFT, self._y, words, 12.5, weight="bold", color=ACCENT)
         self._y -= 0.16
+        self._lines(words, 12.5, 0.22, ACCENT)
+        self._y -= 0.16
+
+    def _lines(self, words: str, size: float, step: float, color: str) -> None:
+        """Write bold text of `size` in points, in lines `step` inches apart."""
+        for line in wrapped(spoken(words), self._width, BOLD * size):
+            self._y -= step
+            self._put(LEFT, self._y, line, size, weight="bold", color=color)
 
     def text(self, words: str, size: float = 8.5, *, color: str = INK, indent: float = 0.0) -> None:
         """Write a paragraph; `size` is in points, `indent` in inches."""
@@ -136,7 +145,7 @@ class Paper:
     ) -> None:
         """Write one row of a table, with a line above it."""
         size, step = 8.0, 0.155
-        bold = 1.1 if weight == "bold" else 1.0
+        bold = BOLD if weight == "bold" else 1.0
         columns = zip(map(spoken, cells), widths, strict=True)
         lines = [wrapped(cell, self._width * w - 0.12, size * bold) for cell, w in columns]
         self.room(step * max(map(len, lines)) + 0.05)
@@ -181,6 +190,17 @@ class Paper:
         axes.imshow(image, interpolation="none")  # no resampling
         axes.set_axis_off()
         self.text(picture.caption, 8, color=QUIET)
+
+
+def scale_of(page: Callable[[Paper], None]) -> float:
+    """Return the largest of `SCALES` at which one page holds all of it; the smallest where none does."""
+
+    def fits(scale: float) -> bool:
+        draft = Paper("", scale=scale)
+        page(draft)
+        return draft.count == 1
+
+    return next(filter(fits, SCALES), SCALES[-1])
 
 
 def wrapped(words: str, width_in: float, size: float) -> list[str]:

@@ -1,12 +1,13 @@
 """Report as PDF on A4 pages: the answer, then flow, anatomy and devices, then an appendix on how they were found."""
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import Any, Final
 
 from vstent.flow.grade import GOOD
 from vstent.reporting.definitions import OF_PULSE
 from vstent.reporting.page import Contents
-from vstent.reporting.paper import ACCENT, PAGE_IN, QUIET, Paper
+from vstent.reporting.paper import ACCENT, PAGE_IN, QUIET, Paper, scale_of
 from vstent.reporting.quantities import Change, Quantity, format_change
 from vstent.reporting.ranked import treatment_rows
 from vstent.reporting.uncertainty import between, ends
@@ -32,13 +33,14 @@ def as_pdf(told: Contents) -> bytes:
     from matplotlib import rc_context
 
     with rc_context({"pdf.fonttype": 42, "font.family": "DejaVu Sans"}):
-        paper = Paper(told.name)
-        _answer(paper, told)
-        paper.turn()
+        answer = partial(_answer, told=told)
+        paper = Paper(told.name, scale=scale_of(answer))
+        answer(paper)
+        paper.turn(1.0)
         _flow(paper, told)
         paper.heading("Anatomy")
         _pictures(paper, told, "Anatomy")
-        _pairs(paper, _rows(told.vessel, 1))
+        _pairs(paper, [(_named(quantity, 1), quantity.text) for quantity in told.vessel])
         paper.heading("Openings")
         paper.table(told.openings, (0.25, 0.2, 0.2, 0.35), head=("Opening", "Diameter", "Area", "Center (LPS)"))
         _devices(paper, told)
@@ -46,7 +48,8 @@ def as_pdf(told: Contents) -> bytes:
             paper.heading(f"Uncertainty: {varied.title}")
             paper.text(varied.words)
             head = ("Result", "Mean", "95 % lie between", "Share of each cause")
-            rows = [(row.name, row.mean, row.band, _shares(row.shares)) for row in varied.rows]
+            causes = [", ".join(f"{cause} {100 * share:.0f} %" for cause, share in row.shares) for row in varied.rows]
+            rows = [(row.name, row.mean, row.band, cause) for row, cause in zip(varied.rows, causes, strict=True)]
             paper.table(rows, (0.27, 0.13, 0.24, 0.36), head=head)
         paper.heading("Notes and limits")
         for note in (*told.notes, *told.limits):
@@ -129,11 +132,11 @@ def _appendix(paper: Paper, told: Contents) -> None:
             paper.table(implant["facts"], (0.26, 0.74))
         if causes := [(row.name, row.cause) for row in implant["bands"] if row.cause]:
             paper.text("Largest cause of each band (95 %):", 8, color=QUIET)
-            _pairs(paper, causes)
+            paper.table(causes, (0.5, 0.5))
     paper.heading("Appendix: settings and versions")
     for title, lines in told.provenance:
         paper.text(title, color=ACCENT)
-        _pairs(paper, [line for line in lines if line[1] != "–"])
+        _pairs(paper, [line for line in lines if line[1] not in ("–", "")])
 
 
 def _pictures(paper: Paper, told: Contents, section: str) -> None:
@@ -150,16 +153,6 @@ def _pairs(paper: Paper, rows: Sequence[tuple[str, str]]) -> None:
     paper.table(
         [(*one, *other) for one, other in zip(rows[:half], beside, strict=True)], (0.3, 0.18, 0.34, 0.18), names=(0, 2)
     )
-
-
-def _shares(shares: Iterable[tuple[str, float]]) -> str:
-    """Return causes with their shares of the variance."""
-    return ", ".join(f"{cause} {100 * share:.0f} %" for cause, share in shares)
-
-
-def _rows(quantities: Iterable[Quantity], skip: int) -> list[tuple[str, str]]:
-    """Return name and value of quantities; the first `skip` keys of their paths are left out of the names."""
-    return [(_named(quantity, skip), quantity.text) for quantity in quantities]
 
 
 def _named(quantity: Quantity, skip: int) -> str:

@@ -1,6 +1,6 @@
 """Plan of every treatment, one page per implant: pictures, sizes, landing zones, fit, warnings, alternatives."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, Final, NamedTuple
 
@@ -18,17 +18,16 @@ from vstent.plan.criteria import default_criteria
 from vstent.plan.rank import Candidate, alternatives, graded_anew, landing_measures
 from vstent.reporting.figures import Picture, Plate, wire_shots
 from vstent.reporting.page import HASH_DIGITS
-from vstent.reporting.paper import QUIET, Paper
+from vstent.reporting.paper import QUIET, Paper, scale_of
 from vstent.reporting.quantities import format_value
 from vstent.reporting.scene import Implants, scene_of, titled
 from vstent.reporting.uncertainty import ends, how_sure
+from vstent.units import counted
 
 PICTURE_SHARE: Final = 0.19
 """Largest height of the picture as a fraction of the page."""
 MOST_NOTES: Final = 2
 """Largest number of notes on a page; the report has all."""
-SCALES: Final = (1.0, 0.92, 0.84, 0.77, 0.7)
-"""Scales of a page, the largest first; the first at which all of it fits is used. Text has 8 points at scale 1."""
 
 
 class Planned(NamedTuple):
@@ -67,20 +66,13 @@ def plan_pdf(case: Planned) -> bytes:
             )
             for name, key, title, deployment in titled(case.implants)
         ]
-        scales = [next((scale for scale in SCALES if _fits(case.name, page, scale)), SCALES[-1]) for page in pages]
+        scales = [*map(scale_of, pages)]
         paper = Paper(case.name, "plan", scale=scales[0])
         for number, (page, scale) in enumerate(zip(pages, scales, strict=True)):
             if number:
                 paper.turn(scale)
             page(paper)
         return paper.done()
-
-
-def _fits(name: str, page: Callable[[Paper], None], scale: float) -> bool:
-    """Whether one page at a scale holds all of it."""
-    draft = Paper(name, "plan", scale=scale)
-    page(draft)
-    return draft.count == 1
 
 
 def _write(
@@ -107,7 +99,7 @@ def _write(
     for sentence in warnings[: 1 + MOST_NOTES]:
         paper.text(f"– {sentence}", 8)
     if len(warnings) > 1 + MOST_NOTES:
-        paper.text(f"{len(warnings) - 1 - MOST_NOTES} more notes are in the report.", 8, color=QUIET)
+        paper.text(f"{counted(len(warnings) - 1 - MOST_NOTES, 'more note')} in the report.", 8, color=QUIET)
     paper.heading("This size and alternatives")
     paper.table(others, (0.20, 0.13, 0.67), head=("Size", "Score of 100", "Reason"))
     paper.text("Blood flow is not part of this plan. Name, date, signature: ______________________________", 8.5)
@@ -147,7 +139,7 @@ def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str,
             "neck_covered_by_coils_fraction": "Part of the neck that they cover",
         }
         cells = [(words, format_value(key, metrics[key])) for key, words in keys.items()]
-        sizes = [(f"Coil {n}, loops x length", one.coil_label) for n, one in enumerate(stent.coils, start=1)]
+        sizes = [(f"Coil {n}, loops × length", one.coil_label) for n, one in enumerate(stent.coils, start=1)]
         return [("Coils", stent.design.name), *cells, *sizes]
     if isinstance(stent.design, Basket):
         keys = {

@@ -61,7 +61,7 @@ def qualities(metrics: Mapping[str, Any], titles: Mapping[str, str]) -> list[Qua
             computation = (
                 f"grid spacing {spacing}, {one['cells_count']:,} cells, {one['steps_count']:,} time steps, inflow "
                 f"{inflow}{source} (Reynolds number {one['inlet_reynolds_number_count']:.0f}), mass residual "
-                f"{100 * abs(one['mass_residual_fraction']):.2f} %"
+                f"{100 * abs(one['mass_residual_fraction']):.2f}\u202f%"
             )
             found.append(Quality(name, which, one["grade"], "; ".join(one["reasons"]), computation))
     return found

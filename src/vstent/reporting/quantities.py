@@ -172,6 +172,7 @@ def spoken(words: str) -> str:
     """Return a sentence of the program as a page says it: no options, openings by name, signs of typography."""
     words = re.sub(r" \((?:without )?--[^)]*\)", "", words)
     words = re.sub(r"\b((?:in|out)let)_(?=\d)", r"\1 ", words)
+    words = re.sub(r"(\d|\d mm) x (?=\d)", r"\1 × ", words)
     return re.sub(r"(?<=\d)%", "\u202f%", re.sub(r"(?<![\w.\-])-(?=\d)", "−", words))
 
 

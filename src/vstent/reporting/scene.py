@@ -234,7 +234,7 @@ def titled(implants: Implants) -> list[tuple[str, str, str, Deployment]]:
     return [
         (name, key, title, deployed[key])
         for name, deployed in implants.items()
-        for key, title in implant_titles(deployed, f"{name}: ").items()
+        for key, title in implant_titles(deployed, f"{treatment_title(deployed)}: " * (len(implants) > 1)).items()
     ]
 
 

@@ -41,7 +41,7 @@ def resolved() -> FlowCase:
     stent = vstent.deploy(design, anatomy).stent
     numerics = Numerics(cell_size_mm=CELL_MM, wires="resolved")
     case = flow_case(anatomy, (stent,), FlowSettings(inflow_mL_s=1.0, numerics=numerics))
-    return replace(case, vessel=trim(whole, upstream_mm=3.0, downstream_mm=3.0))
+    return replace(case, vessel=trim(whole, upstream_mm=5.0, downstream_mm=3.0))
 
 
 def test_the_blood_is_the_lumen_without_the_wires(resolved: FlowCase) -> None:
@@ -102,17 +102,22 @@ def test_wires_too_thin_for_the_grid_are_walls_on_a_finer_level(resolved: FlowCa
     assert state.kept == (state,)
 
 
+@pytest.mark.parametrize("finer", [1, 2])
 def test_wires_on_a_finer_level_are_those_of_the_uniform_fine_grid(
-    resolved: FlowCase, flow: State, monkeypatch: pytest.MonkeyPatch
+    resolved: FlowCase, flow: State, finer: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without the screen beside the neck, which the fine grid has not: pressure, sac, neck inflow, force within 3 %."""
+    """Without the screen beside the neck, which the fine grid has not: force within 3 %, the rest within 5 %.
+
+    The coarsest grid has 19 or 9 cells across the artery.
+    """
     monkeypatch.setattr(levels, "BESIDE_NECK", 100.0)
-    case = replace(resolved, media=(), numerics=replace(resolved.numerics, cell_size_mm=2 * CELL_MM))
-    engine = LatticeBoltzmann(2 * CELL_MM)
+    case = replace(resolved, media=(), numerics=replace(resolved.numerics, cell_size_mm=2**finer * CELL_MM))
+    engine = LatticeBoltzmann(2**finer * CELL_MM)
     state = engine.init(case, None)
+    assert len(state.levels) == 1 + finer
     while len(state.history) < 16:
         stepping.step(state)
-    np.testing.assert_allclose(state.history[-1], flow.history[-1], rtol=0.03)
+    np.testing.assert_allclose(state.history[-1], flow.history[-1], rtol=0.05)
     force, wanted = force_N(state.levels[-1]), force_N(flow)
     assert np.linalg.norm(force - wanted) < 0.03 * np.linalg.norm(wanted)
     between = state.interface

@@ -84,7 +84,7 @@ def _cells(case: FlowCase, cell_size_mm: float) -> list[float]:
     sizes, volumes_mm3 = sizes_mm(case, cell_size_mm), [extended_volume_mm3(case.vessel)]
     if case.numerics.close_up:
         volumes_mm3.append(volume_mm3(case, sizes[0]))
-    volumes_mm3 += [volume_near_wires_mm3(case, size_mm) for size_mm in sizes[len(volumes_mm3) - 1 : -1]]
+    volumes_mm3 += [volume_near_wires_mm3(case, one_mm, sizes[-1]) for one_mm in sizes[len(volumes_mm3) - 1 : -1]]
     return [volume / size_mm**3 for volume, size_mm in zip(volumes_mm3, sizes, strict=True)]
 
 

@@ -133,7 +133,9 @@ class LatticeBoltzmann(AbstractLattice):
         """Return the last check of a converged flow, or the time average of an unsteady one."""
         left = _left(state)
         if left < state.case.numerics.tolerance:
-            flows = [read(level, [level.snapshots[-1]]) for level in state.kept]
+            finer = stepping.snapshots(state)[len(state.kept) :] if state.levels != state.kept else []
+            last = [*(level.snapshots[-1] for level in state.kept), *finer]
+            flows = [read(level, [one]) for level, one in zip(state.levels, last, strict=True)]
             return field_of(state, flows, outcome, left, "The flow has converged.")
         mean = _mean(state)
         uncertain, advice = _of_mean(state, mean, is_converged=outcome.is_converged)

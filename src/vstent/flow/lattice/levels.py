@@ -73,8 +73,9 @@ The flow into the sac forms upstream: beside the same spacing everywhere (0.14 m
 with one diameter, 1 % lower with two, 3 % higher with three and 1 % higher with five."""
 BESIDE_NECK: Final = 6.0
 """Distance from the sac up to which wires are walls on finer levels, in thicknesses; beyond they are a screen."""
-MARGIN_CELLS: Final = 7.0
-"""Distance in cells by which a refined part around wires exceeds the next finer one, the diagonal of `RIM` included."""
+MARGIN_CELLS: Final = 14.0
+"""Distance in cells by which a refined part around wires exceeds the next finer one: with less, the distance kept from
+the border and `RIM` leave no room for that along diagonals."""
 CHANGING: Final = ("crossed", "lack", "push")
 """Arrays of an `Interface` that change during a run."""
 CHUNK: Final = 50_000
@@ -178,11 +179,35 @@ def near_sac(case: FlowCase, grid: Domain) -> Bools:
     return is_near | (is_upstream & (distance_mm <= UPSTREAM_DIAMETERS * diameter_mm))
 
 
-def _reach_mm(case: FlowCase, size_mm: float) -> float:
+def _narrow(case: FlowCase, size_mm: float) -> tuple[Floats, Floats, Floats]:
+    """Return the points (m, 3) of centerlines in branches too narrow for a grid, their radii (m,), and steps (m,).
+
+    There are none where the flow through a branch does not depend on its resistance.
+    """
+    lines = () if case.is_split_given else case.vessel.centerlines
+    columns = [
+        np.column_stack([one.points_mm, one.inscribed_radius_mm, np.gradient(one.abscissa_mm)])[
+            2 * one.inscribed_radius_mm < domains.BRANCH_CELLS * size_mm
+        ]
+        for one in lines
+    ]
+    found = np.concatenate([np.zeros((0, 5)), *columns])
+    return found[:, :3], found[:, 3], found[:, 4]
+
+
+def near_narrow(case: FlowCase, grid: Domain) -> Bools:
+    """Return whether each cell (n,) lies in a branch too narrow for the grid."""
+    points_mm, radius_mm, _ = _narrow(case, grid.cell_size_mm)
+    if not len(points_mm):
+        return np.zeros(len(grid.cells), dtype=bool)
+    away_mm, nearest = cKDTree(points_mm).query(grid.centers_mm)
+    return away_mm < 1.5 * radius_mm[nearest]
+
+
+def _reach_mm(case: FlowCase, size_mm: float, finest_mm: float) -> float:
     """Return the distance from wires to which a grid with this spacing is refined: their thickness at the finest."""
     assert case.wires is not None
-    thick_mm = thickness_mm(case.wires)
-    return thick_mm + MARGIN_CELLS * max(0.0, size_mm - WIDTH * thick_mm / domains.ACROSS)
+    return thickness_mm(case.wires) + MARGIN_CELLS * max(0.0, size_mm - WIDTH * finest_mm)
 
 
 def _walls(case: FlowCase) -> Surface:
@@ -194,18 +219,18 @@ def _walls(case: FlowCase) -> Surface:
     return Surface(case.wires.vertices_mm, case.wires.faces[is_near])
 
 
-def near_wires(case: FlowCase, grid: Domain) -> Bools:
-    """Return whether each cell (n,) lies near wires that finer levels take as walls."""
-    wires, reach_mm = _walls(case), _reach_mm(case, grid.cell_size_mm)
+def near_wires(case: FlowCase, grid: Domain, finest_mm: float) -> Bools:
+    """Return whether each cell (n,) lies near wires that finer levels take as walls, the finest with this spacing."""
+    wires, reach_mm = _walls(case), _reach_mm(case, grid.cell_size_mm, finest_mm)
     low, high = wires.vertices_mm.min(axis=0) - reach_mm, wires.vertices_mm.max(axis=0) + reach_mm
     result = ((grid.centers_mm > low) & (grid.centers_mm < high)).all(axis=1)
     result[result] = wires.closest(grid.centers_mm[result])[1] < reach_mm
     return result
 
 
-def volume_near_wires_mm3(case: FlowCase, size_mm: float) -> float:
+def volume_near_wires_mm3(case: FlowCase, size_mm: float, finest_mm: float) -> float:
     """Estimate the volume of what is refined around wires on a grid with this spacing."""
-    reach_mm = _reach_mm(case, size_mm) + 1.2 * RIM * size_mm
+    reach_mm = _reach_mm(case, size_mm, finest_mm) + 1.2 * RIM * size_mm
     step_mm, corners_mm = reach_mm / 4, _walls(case).corners_mm
     low_mm = corners_mm.min(axis=(0, 1)) - reach_mm - 2 * step_mm
     at = np.rint((corners_mm.mean(axis=1) - low_mm) / step_mm).astype(int)
@@ -217,12 +242,15 @@ def volume_near_wires_mm3(case: FlowCase, size_mm: float) -> float:
 
 
 def volume_mm3(case: FlowCase, coarse_mm: float) -> float:
-    """Estimate the volume of the refined part of a case, the sac and a piece of the artery."""
+    """Estimate the volume of the refined part of a case: the sac, a piece of the artery, and narrow branches."""
     sac, diameter_mm = require_sac(case), domains.mean_diameter_mm(case.vessel)
     neck_mm2 = 0.0 if case.ostium is None else case.ostium.area_mm2
     stretch_mm = (UPSTREAM_DIAMETERS + DOWNSTREAM_DIAMETERS) * diameter_mm + sqrt(4 / pi * neck_mm2)
     stretch_mm += 2 * RIM * coarse_mm
-    return min(abs(sac.volume_mm3) + pi / 4 * diameter_mm**2 * stretch_mm, abs(case.vessel.closed.volume_mm3))
+    _, radius_mm, step_mm = _narrow(case, coarse_mm)
+    branches_mm3 = float((pi * radius_mm**2 * step_mm).sum())
+    wanted_mm3 = abs(sac.volume_mm3) + pi / 4 * diameter_mm**2 * stretch_mm + branches_mm3
+    return min(wanted_mm3, abs(case.vessel.closed.volume_mm3))
 
 
 def window(grid: Domain, is_wanted: Bools, is_outer: Bools | None = None) -> tuple[Window, Ints]:
@@ -262,22 +290,22 @@ def sizes_mm(case: FlowCase, cell_size_mm: float) -> tuple[float, ...]:
     coarser = int(case.numerics.close_up and require_sac(case) is not None)
     finer = 0
     if case.numerics.wires == "resolved" and case.wires is not None:
-        finer = max(0, ceil(log2(domains.ACROSS * cell_size_mm / thickness_mm(case.wires)) - 0.55))
+        finer = max(0, ceil(log2(domains.LEAST_ACROSS * cell_size_mm / thickness_mm(case.wires))))
     return tuple(cell_size_mm / WIDTH**k for k in range(-coarser, finer + 1))
 
 
 def refined(case: FlowCase, coarse: Grid, finest_mm: float) -> tuple[Grid, Grid, Interface]:
     """Return a grid, the next finer one in it, and the coupling of both.
 
-    With `close_up` the first grid is refined in the sac; all are around wires. Wires are walls of the finer grid where
-    they are thick enough for it.
+    With `close_up` the first grid is refined in the sac and in narrow branches; all are around wires. Wires are walls
+    of the finer grid where they are thick enough for it.
     """
     wide = coarse.domain
-    wanted = (
-        near_sac(case, wide) if case.numerics.close_up and not coarse.crossings else np.zeros(len(wide.cells), bool)
-    )
+    wanted = np.zeros(len(wide.cells), bool)
+    if case.numerics.close_up and not coarse.crossings:
+        wanted = near_sac(case, wide) | near_narrow(case, wide)
     if case.numerics.wires == "resolved" and case.wires is not None and wide.cell_size_mm > 1.5 * finest_mm:
-        wanted |= near_wires(case, wide)
+        wanted |= near_wires(case, wide, finest_mm)
     part, layer = window(wide, wanted, None if coarse.side is None else coarse.side % 2 == 0)
     size_mm = wide.cell_size_mm / WIDTH
     domain = domains.build(case.vessel, size_mm, part, domains.wires_of(case, size_mm))

@@ -82,14 +82,14 @@ def joined(state: State, flows: Sequence[Reading]) -> Reading:
     A vertex belongs to a finer level where the cells from which its stress is computed lie inside the border.
     """
     wall, result = state.case.vessel.lumen, flows[0]
-    for coarse, fine, flow in zip(state.kept[:-1], state.kept[1:], flows[1:], strict=True):
+    for coarse, fine, flow in zip(state.levels, state.levels[1:], flows[1:], strict=False):
         is_fine = trusted(coarse, fine, wall.vertices_mm - fine.domain.cell_size_mm * wall.vertex_normals)
         for name in ("wall_shear_stress_Pa", "wall_pressure_Pa", "mean_shear_Pa"):
             values = getattr(flow, name)
             if values is not None:
                 chosen = np.where(is_fine if values.ndim == 1 else is_fine[:, None], values, getattr(result, name))
                 result = replace(result, **{name: chosen})
-    return replace(result, neck_inflow_mL_s=flows[-1].neck_inflow_mL_s)
+    return replace(result, neck_inflow_mL_s=flows[len(state.kept) - 1].neck_inflow_mL_s)
 
 
 def field_of(
@@ -100,13 +100,13 @@ def field_of(
     advice: str,
     phases: tuple[Phase, ...] = (),
 ) -> FlowField:
-    """Return the flow field of a run from the flow on every level."""
+    """Return the flow field of a run from the flow on the levels kept, and on finer ones for the values at the wall."""
     vessel, flow, finest = state.case.vessel, joined(state, flows), state.levels[-1]
     section_Pa = domains.section_pressure_Pa(vessel, state.domain, flow.pressure_Pa)
     inlet_Pa, outlet_Pa = vessel.of_inlets_and_outlets(section_Pa)
     levels = tuple(
         Level.of(level.domain, one.velocity_m_s, one.pressure_Pa, one.mean_speed_m_s)
-        for level, one in zip(state.kept, flows, strict=True)
+        for level, one in zip(state.kept, flows, strict=False)
     )
     common_Pa = 0.0
     if state.case.resistances:
@@ -157,7 +157,7 @@ def _remarks(state: State, levels: Sequence[Level], phases: Sequence[Phase]) -> 
         remarks += f" The grid spacing is {sizes}, from the whole vessel to the finest level."
     if state.device is not None:
         remarks += f" Time steps were launched on the GPU {state.device.how}."
-    remarks += domains.too_narrow(case, state.domain.cell_size_mm) + domains.unreached(case.vessel, state.domain)
+    remarks += domains.too_narrow(case, state.main.domain.cell_size_mm) + domains.unreached(case.vessel, state.domain)
     for number, (level, own) in enumerate(zip(state.kept, levels, strict=True)):
         moments_m_s = [phase.velocity_m_s[number] for phase in phases] or [own.velocity_m_s]
         speed_m_s = np.max([np.linalg.norm(one, axis=1) for one in moments_m_s], axis=0)

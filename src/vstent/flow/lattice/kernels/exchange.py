@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numba import njit, prange
 
+from vstent.flow.lattice.kernels import lanes
 from vstent.flow.lattice.kernels.collision import carried, moments_of, stress_size, thinned
 from vstent.flow.lattice.kernels.d3q19 import OPPOSITE
 from vstent.kernels.directions import VELOCITIES
@@ -16,8 +17,10 @@ _HALF = np.float32(0.5)
 _AXES: Final = VELOCITIES.astype(np.float32)
 _EVEN: Final = 16
 """Number of values per cell that are interpolated with the weights of the even part: those before the odd part."""
-_VALUES: Final = 25
-"""Number of values per cell: rest population, half sums of pairs (9), products u u (6), half differences (9)."""
+_VALUES: Final = 2 * _EVEN
+"""Number of values per cell: rest population, half sums of pairs (9), products u u (6), half differences (9), zeros."""
+_STARTS: Final = tuple(range(0, _EVEN, lanes.COUNT))
+"""First of the values in each vector register that holds those of either part."""
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
@@ -34,6 +37,19 @@ def _split(f: Any, stride: int, at: int, values: Any) -> None:
         z += _AXES[q, 2] * (first - second)
     values[10], values[11], values[12] = x * x, y * y, z * z
     values[13], values[14], values[15] = x * y, x * z, y * z
+
+
+def _plus_one(total: Any, weight: float, values: Any) -> Any:
+    """Return one Lanes plus the product of a weight and another one, both in tuples."""
+    return (total[0] + weight * values[0],)
+
+
+def _plus_two(total: Any, weight: float, values: Any) -> Any:
+    """Return two Lanes plus the products of a weight and two others, in tuples."""
+    return total[0] + weight * values[0], total[1] + weight * values[1]
+
+
+_plus: Final = njit(cache=True, forceinline=True)(_plus_one if len(_STARTS) == 1 else _plus_two)
 
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
@@ -56,17 +72,18 @@ def carry(f: Any, stride: int, stencil: Any, push: Any, into: Any, numbers: Any)
     place, start, cell, weight, group, part = stencil
     g, new_stride, new_place, limit = into
     ratio, time, law, odd_rate, new_odd_rate = numbers
-    read = np.zeros((len(place), _VALUES), np.float32)
+    read = np.zeros((len(place) + 1) * _VALUES, np.float32)
     for c in prange(len(place)):
-        _split(f, stride, place[c], read[c])
+        _split(f, stride, place[c], read[c * _VALUES : (c + 1) * _VALUES])
     for i in prange(len(new_place)):
         values, held = np.zeros(_VALUES, np.float32), np.zeros(19, np.float32)
+        even = odd_part = lanes.gather(read, _STARTS, len(place) * _VALUES)  # zeros
         for e in range(start[i], start[i + 1]):
-            of_cell = read[cell[e]]
-            for k in range(_EVEN):
-                values[k] += weight[e, 0] * of_cell[k]
-            for k in range(_EVEN, _VALUES):
-                values[k] += weight[e, 1] * of_cell[k]
+            at = cell[e] * _VALUES
+            even = _plus(even, weight[e, 0], lanes.gather(read, _STARTS, at))
+            odd_part = _plus(odd_part, weight[e, 1], lanes.gather(read, _STARTS, at + _EVEN))
+        lanes.scatter(values, _STARTS, 0, even, lanes.COUNT)
+        lanes.scatter(values, _STARTS, _EVEN, odd_part, lanes.COUNT)
         held[0] = values[0]
         x, y, z = part[i]
         for k in range(9):
