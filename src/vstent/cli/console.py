@@ -273,12 +273,12 @@ def treatments_table(ranked: Sequence[Mapping[str, Any]]) -> Table:
 
 def treatment_reasons(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return one line per treatment with the reasons for its rank."""
-    return "\n".join(f"{n}. {row['treatment']}: {row['reason']}" for n, row in enumerate(rows, start=1))
+    return "\n".join(f"{n}. {row['treatment']}: {_typed('{}', row['reason'])}" for n, row in enumerate(rows, start=1))
 
 
 def ranking_reasons(ranking: Ranking, shown: int) -> str:
     """Return one line per candidate with the reasons for its rank."""
-    return "\n".join(f"{n}. {candidate.label}: {candidate.reason}" for n, candidate in _shown(ranking, shown))
+    return "\n".join(f"{n}. {one.label}: {_typed('{}', one.reason)}" for n, one in _shown(ranking, shown))
 
 
 def _shown(ranking: Ranking, count: int) -> list[tuple[int, Candidate]]:

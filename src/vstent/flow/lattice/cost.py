@@ -36,6 +36,9 @@ WHOLE_OVER_BLOCK = 3.5
 """Ratio of the run time of a flow to that of its time steps in a block of blood that fits the cache. The rest is walls,
 openings, checks, the initial flow and memory access. Measured: demo with Silk at 0.14 mm, 123 million updates per
 second against 440 in the block; 3.4 for C0038 at 0.2 mm, 4.8 for a small bifurcation."""
+AROUND_WIRES_OVER_BLOCK = 10.0
+"""The same with finer levels around wires, where most of the time goes into the exchange between thin levels (demo with
+Enterprise from 0.2 to 0.025 mm: 44 million updates per second on two cores)."""
 BLOCK_ROWS = 4095
 """Number of rows of the block used to measure the speed; odd, so that populations are not whole pages apart (see
 `setup.PAGE`)."""
@@ -74,8 +77,10 @@ def estimate(case: FlowCase) -> Cost:
     cell_size_mm = default_cell_size_mm(case)
     cells, memory_bytes = _size(case, cell_size_mm)
     steps = _steps(case, cell_size_mm)
-    updates = sum(of_level * steps / WIDTH**depth for depth, of_level in enumerate(_cells(case, cell_size_mm)[::-1]))
-    seconds = updates / block_rate(on_gpu=case.numerics.device_gpu) * WHOLE_OVER_BLOCK
+    of_levels = _cells(case, cell_size_mm)[::-1]
+    updates = sum(of_level * steps / WIDTH**depth for depth, of_level in enumerate(of_levels))
+    over_block = WHOLE_OVER_BLOCK if len(of_levels) <= 1 + case.numerics.close_up else AROUND_WIRES_OVER_BLOCK
+    seconds = updates / block_rate(on_gpu=case.numerics.device_gpu) * over_block
     return Cost(cell_size_mm, round(cells), round(memory_bytes), steps, seconds)
 
 
@@ -155,7 +160,7 @@ def part_of_steps(levels: int, kept: int) -> float:
 
     It is small where it begins from a flow on the coarsest level, or from the flow with a screen.
     """
-    return 1.0 if levels == 1 else 1 / 3 if levels == kept else 1 / 16
+    return 1.0 if levels == 1 else 1 / 3 if levels == kept else 1 / 8
 
 
 @cache

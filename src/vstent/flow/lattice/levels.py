@@ -78,7 +78,7 @@ MARGIN_CELLS: Final = 14.0
 the border and `RIM` leave no room for that along diagonals."""
 CHANGING: Final = ("crossed", "lack", "push")
 """Arrays of an `Interface` that change during a run."""
-CHUNK: Final = 50_000
+CHUNK: Final = 10_000
 """Number of cells whose stencils are computed at once."""
 MOST_PUSHED: Final = 0.03
 """Largest momentum that is added at a border, over that of the cells that are set."""
@@ -423,11 +423,13 @@ def stencil(read: Grid, written: Grid, target: Ints, group: Ints, share: Floats)
     weight = np.concatenate([part[2] for part in parts])
     is_near = counts > 0
     target, group, share = target[is_near], group[is_near], share[is_near]
-    place, number = np.unique(read.addressing.place[cell], return_inverse=True)
+    is_read = np.zeros(len(read.domain.cells), dtype=bool)
+    is_read[cell] = True
+    number = np.cumsum(is_read, dtype=np.int32) - 1
     return Stencil(
-        place,
+        read.addressing.place[is_read],
         np.r_[0, np.cumsum(counts[is_near])].astype(np.int32),
-        number.astype(np.int32),
+        number[cell],
         weight,
         written.addressing.place[target],
         written.limit[target],
