@@ -112,12 +112,18 @@ def test_lines_keep_inside_the_page():
     from matplotlib.textpath import TextToPath
 
     words = (
-        "MMMMM WWWW The contour is the paper's active contour (Zhong et al. 2016) with a wall that does not give way. "
+        "MMMMM WWWW The contour is the paper's active contour (Zhong et al. 2016) with a wall that does not give way. ",
+        "2 mm × 6.25 cm, 4.94 cm, ",
+        40 * "0123456789abcdef",
     )
     metrics, font = TextToPath(), FontProperties(family="DejaVu Sans", size=8.5)
     width_in = PAGE_IN[0] - LEFT - RIGHT
-    for line in wrapped(words * 5, width_in, 8.5):
-        assert metrics.get_text_width_height_descent(line, font, ismath=False)[0] < 72 * width_in
+    for some in words:
+        lines = wrapped(some * 5, width_in, 8.5)
+        wide_in = [metrics.get_text_width_height_descent(line, font, ismath=False)[0] / 72 for line in lines]
+        assert max(wide_in) < width_in
+        assert min(wide_in[:-1]) > 0.8 * width_in
+        assert "".join(lines).replace(" ", "") == (some * 5).replace(" ", "")
 
 
 def test_pictures_tell_the_way_from_the_artery_to_the_flow(told):

@@ -1,8 +1,8 @@
 """A4 pages as PDF, filled from top to bottom with headings, text, tables and pictures."""
 
 import io
-import textwrap
 from collections.abc import Callable, Collection, Iterable, Sequence
+from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -18,8 +18,8 @@ LEFT, RIGHT, TOP, FOOT = 0.75, 0.75, 0.85, 0.80
 """Margins in inches."""
 INK, QUIET, ACCENT, LINE, WARN = "#16262e", "#54666f", "#0b6473", "#d7dfe3", "#8a4b08"
 """Colors of text, secondary text, headings, rules and the statement at the foot."""
-_CHARACTER: Final = 0.53
-"""Mean width of a character as a fraction of the font size, for line breaks."""
+FONT_POINTS: Final = 100
+"""Font size at which the widths of characters are read."""
 BOLD: Final = 1.1
 """Width of bold text in that of regular text."""
 BESIDE_IN: Final = 0.25
@@ -205,5 +205,30 @@ def scale_of(page: Callable[[Paper], None]) -> float:
 
 def wrapped(words: str, width_in: float, size: float) -> list[str]:
     """Return text broken into lines of at most `width_in` inches; `size` is the font size in points."""
-    count = max(6, int(width_in * 72 / (_CHARACTER * size)))
-    return textwrap.wrap(words, count, break_long_words=True, break_on_hyphens=False) or [""]
+    most, lines = 72 * width_in / size, [""]
+    for word in words.split():
+        longer = f"{lines[-1]} {word}".lstrip()
+        if _width(longer) <= most:
+            lines[-1] = longer
+            continue
+        lines += [word] if lines[-1] else []
+        lines[-1] = word
+        while _width(lines[-1]) > most and len(lines[-1]) > 1:  # a word longer than a line
+            fits = max(1, sum(_width(lines[-1][: n + 1]) <= most for n in range(len(lines[-1]))))
+            lines[-1:] = lines[-1][:fits], lines[-1][fits:]
+    return lines
+
+
+def _width(words: str) -> float:
+    """Return the width of text in matplotlib's font as a fraction of the font size."""
+    return sum(map(_advance, words))
+
+
+@cache
+def _advance(character: str) -> float:
+    """Return the width of a character as a fraction of the font size."""
+    from matplotlib.font_manager import FontProperties, findfont, get_font
+
+    font = get_font(findfont(FontProperties()))
+    font.set_size(FONT_POINTS, 72)
+    return float(font.load_char(ord(character)).linearHoriAdvance) / 65536 / FONT_POINTS
