@@ -22,6 +22,11 @@ def counted(n: int, one: str, many: str = "") -> str:
     return f"{n} {one if n == 1 else many or one + 's'}"
 
 
+def duration(seconds: float) -> str:
+    """Return a time as text: ``9 s``, ``16 min``."""
+    return f"{max(seconds, 1):.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
+
+
 def place(point_mm: Iterable[float]) -> str:
     """Return a point (3,) as text: ``(1.0, -2.5, 30.2) mm``."""
     return f"({', '.join(f'{x:z.1f}' for x in point_mm)}) mm"

@@ -70,9 +70,9 @@ def test_of_several_implants_every_measure_is_told_in_their_order() -> None:
 @pytest.mark.parametrize(
     ("told", "words"),
     [
-        (Progress("flow silk", 0.5, residual=0.0279, seconds_left=61.4), "2.8% from convergence, 61 s left"),
+        (Progress("flow silk", 0.5, residual=0.0279, seconds_left=61.4), "2.8% from convergence, about 61 s left"),
         (Progress("vary silk", 0.5, "3 of 32"), "3 of 32"),
-        (Progress("angiogram bare", 0.5, seconds_left=0.0), "1 s left"),
+        (Progress("angiogram bare", 0.5, seconds_left=0.0), "about 1 s left"),
         (Progress("segment", 0.0), ""),
     ],
 )

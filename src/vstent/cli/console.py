@@ -26,7 +26,7 @@ from vstent.reporting.ranked import treatment_rows
 from vstent.reporting.uncertainty import ends, how_sure, intervals, number_name
 from vstent.study.followup import Followup
 from vstent.study.progress import Progress
-from vstent.units import counted
+from vstent.units import counted, duration
 
 ROWS: Final = (
     ("Neck inflow", "neck_inflow_mL_s"),
@@ -126,8 +126,7 @@ def _state(told: Progress) -> str:
     if told.residual is not None:
         parts.append(f"{told.residual:.1%} from convergence")
     if told.seconds_left is not None:
-        left_s = told.seconds_left
-        parts.append(f"{max(left_s, 1):.0f} s left" if left_s < 90 else f"about {left_s / 60:.0f} min left")
+        parts.append(f"about {duration(told.seconds_left)} left")
     return ", ".join(part for part in parts if part)
 
 

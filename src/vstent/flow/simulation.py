@@ -25,6 +25,7 @@ from vstent.flow.memory import free_memory_bytes
 from vstent.flow.problem import flow_case
 from vstent.flow.settings import LATTICE, OPENFOAM, RESISTING, FlowSettings, Numerics, Wires
 from vstent.geometry.vessel import Anatomy
+from vstent.units import duration
 
 SCREEN_SHARE = 0.2
 """Assumed share of the run time of the flow with a screen, from which one with resolved wires begins."""
@@ -137,7 +138,7 @@ def _decided(case: FlowCase) -> tuple[FlowCase, str]:
     if case.numerics.wires != "auto" or case.numerics.engine != LATTICE or case.wires is None or are_coils:
         return (_with_wires(case, "screen") if case.numerics.wires == "auto" else case), ""
     cost = estimate(_with_wires(case, "resolved"))
-    how = f"resolving them would take {cost.seconds / 60:.2g} min and {cost.memory_bytes / 1e9:.2g} GB."
+    how = f"resolving them would take {duration(cost.seconds)} and {cost.memory_bytes / 1e9:.2g} GB."
     if case.numerics.device_gpu or cost.seconds > QUICK_S or cost.memory_bytes > free_memory_bytes():
         return _with_wires(case, "screen"), f" The wires are a screen: {how}"
     return _with_wires(case, "resolved"), ""

@@ -17,6 +17,7 @@ from vstent.flow.lattice.kernels.warm import keep_flow
 from vstent.flow.lattice.levels import WIDTH, sizes_mm, volume_mm3, volume_near_wires_mm3
 from vstent.flow.lattice.pace import pace
 from vstent.flow.memory import free_memory_bytes
+from vstent.units import duration
 
 BYTES_PER_CELL = 750
 """Peak memory per cell of blood, in bytes. Measured on 0.3 to 0.8 million cells: 300 for the time steps, 280 for the
@@ -67,7 +68,7 @@ class Cost:
         """Return the estimate as one sentence."""
         return (
             f"Grid spacing {self.cell_size_mm:.3g} mm ({self.cells:,.0f} cells), memory "
-            f"{self.memory_bytes / 1e9:.2g} GB, run time at most {self.seconds / 60:.2g} min per flow "
+            f"{self.memory_bytes / 1e9:.2g} GB, run time at most {duration(self.seconds)} per flow "
             f"({self.steps:,} time steps)."
         )
 

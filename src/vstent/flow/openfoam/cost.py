@@ -13,6 +13,7 @@ from vstent.flow.memory import free_memory_bytes
 from vstent.flow.openfoam.case import strut_solids
 from vstent.flow.openfoam.setup import FoamSetup
 from vstent.flow.settings import LATTICE
+from vstent.units import duration
 
 CELLS_PER_CUBE: Final = 1.6
 """Number of mesh cells over the blood's volume in cubic grid spacings: more than 1 because of layers and the refined
@@ -56,7 +57,7 @@ def tell_cost(case: FlowCase, cell_size_mm: float) -> str:
     of_struts = f", {at_struts / 1e3:,.0f} thousand more at the struts" if at_struts else ""
     return (
         f"OpenFOAM: about {bare / 1e3:,.0f} thousand cells at a grid spacing of {cell_size_mm:.3g} mm{of_struts}, "
-        f"{needed / 1e9:.2g} GB of memory, {seconds / 60:.2g} min on one core for a steady flow."
+        f"{needed / 1e9:.2g} GB of memory, {duration(seconds)} on one core for a steady flow."
     )
 
 
