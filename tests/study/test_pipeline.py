@@ -365,7 +365,7 @@ def test_stopped_in_a_flow_it_keeps_the_finished_one_and_goes_on(
     assert leo["change"]["neck_inflow_mL_s_ratio"] == pytest.approx(1.0)
     assert bare["flow"]["neck_inflow_mL_s"] == pytest.approx(bare["flow"]["neck_outflow_mL_s"], rel=0.1)
     report = (out / "report.html").read_text()
-    assert all(f"{words}: The flow has " in report for words in ("Flow without a device", "Flow, leo"))
+    assert all(f"{words}: The flow has " in report for words in ("Flow without a device", "Flow with LEO 4.5 × 15 mm"))
     left = bare["flow"]["unsettled_fraction"]
     assert (left < 0.01) == ("Flow without a device: The flow has converged" in report)
     assert leo["flow"]["unsettled_fraction"] == left > 0
