@@ -27,7 +27,7 @@ from vstent.flow.settings import LATTICE, OPENFOAM, RESISTING, FlowSettings, Num
 from vstent.geometry.vessel import Anatomy
 from vstent.units import duration
 
-SCREEN_SHARE = 0.2
+SCREEN_SHARE = 0.02
 """Assumed share of the run time of the flow with a screen, from which one with resolved wires begins."""
 COARSE_SHARE = 0.12
 """Assumed share of the run time of each coarse run, for the progress."""
