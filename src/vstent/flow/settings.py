@@ -151,7 +151,8 @@ class Numerics:
     and the velocity in the sac by less than twice this fraction (root mean square). An unsteady flow has converged
     when the standard error of every time average is smaller than this fraction."""
     max_steps: int = 96_000
-    """Maximum number of time steps of a steady flow on the finest grid. With `close_up` at most a third of them."""
+    """Maximum number of time steps of a steady flow on the finest grid kept. With `close_up` at most a third of them,
+    with finer levels around wires an eighth."""
     max_cycles: int = 4
     """Maximum number of cycles of a pulsatile flow."""
     cycle_tolerance: float = 0.02
