@@ -113,7 +113,7 @@ def test_lines_keep_inside_the_page():
 
     words = (
         "MMMMM WWWW The contour is the paper's active contour (Zhong et al. 2016) with a wall that does not give way. ",
-        "2 mm × 6.25 cm, 4.94 cm, ",
+        "2\u202fmm × 6.25\u202fcm, 4.94\u202fcm, ",
         40 * "0123456789abcdef",
     )
     metrics, font = TextToPath(), FontProperties(family="DejaVu Sans", size=8.5)

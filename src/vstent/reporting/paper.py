@@ -1,6 +1,7 @@
 """A4 pages as PDF, filled from top to bottom with headings, text, tables and pictures."""
 
 import io
+import re
 from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final
@@ -206,7 +207,7 @@ def scale_of(page: Callable[[Paper], None]) -> float:
 def wrapped(words: str, width_in: float, size: float) -> list[str]:
     """Return text broken into lines of at most `width_in` inches; `size` is the font size in points."""
     most, lines = 72 * width_in / size, [""]
-    for word in words.split():
+    for word in re.split("[ \n]+", words.strip()):  # a narrow space keeps a number and its unit together
         longer = f"{lines[-1]} {word}".lstrip()
         if _width(longer) <= most:
             lines[-1] = longer
