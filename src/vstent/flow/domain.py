@@ -30,8 +30,8 @@ BRANCH_CELLS = 6.0
 """Number of cells across that a branch needs. Tubes at an angle to the grid have 2 to 70 % too much resistance with
 six cells across (Re 10 to 340), 10 to 310 % with four, and 1.4 to 15 times the right one with three."""
 LEAST_ACROSS = 2.3
-"""Number of cells that a wire taken as a wall needs across. Rows of wires have, by their position on the grid, -20 to
-+6 % of drag too much with two cells across, -8 to +2 % with three and -4 to +2 % with four."""
+"""Number of cells that a wire taken as a wall needs across. The error in the drag of rows of wires, by their
+position on the grid, is -20 to +6 % with two cells across, -8 to +2 % with three and -4 to +2 % with four."""
 WALL = 0
 """Patch number of the wall; opening k has patch number k + 1."""
 LEAST_PIECE = 64

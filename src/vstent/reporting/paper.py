@@ -215,7 +215,8 @@ def wrapped(words: str, width_in: float, size: float) -> list[str]:
         lines += [word] if lines[-1] else []
         lines[-1] = word
         while _width(lines[-1]) > most and len(lines[-1]) > 1:  # a word longer than a line
-            fits = max(1, sum(_width(lines[-1][: n + 1]) <= most for n in range(len(lines[-1]))))
+            ends = np.cumsum([_advance(character) for character in lines[-1]])
+            fits = max(1, int(np.searchsorted(ends, most, side="right")))
             lines[-1:] = lines[-1][:fits], lines[-1][fits:]
     return lines
 
