@@ -20,7 +20,7 @@ import argparse
 import json
 import time
 from contextlib import nullcontext
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -32,9 +32,8 @@ from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
 from vstent.deployment.struts import is_over_restored
-from vstent.devices.stent import Stent
 from vstent.flow import sampling
-from vstent.flow.case import FlowCase, FlowField, Sheet
+from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.engines import run
 from vstent.flow.indices import indices
 from vstent.flow.openfoam import setup
@@ -43,7 +42,7 @@ from vstent.flow.problem import flow_case
 from vstent.flow.settings import OPENFOAM, FlowSettings
 from vstent.flow.simulation import simulate_case
 from vstent.geometry.surface import Surface
-from vstent.geometry.vessel import Anatomy, Vessel
+from vstent.geometry.vessel import Vessel
 from vstent.phantoms import Phantom
 
 TABLE = Path(__file__).with_suffix(".json")
@@ -83,15 +82,12 @@ def cases(names: list[str], phantom: Phantom, kept_mm: float) -> dict[str, tuple
     found = {}
     for name, implants in {"bare": (), **stents}.items():
         whole_case = replace(flow_case(anatomy, implants, settings), vessel=short)
-        parts = (where_meshed(sheet, one, anatomy) for sheet, one in zip(whole_case.media, implants, strict=True))
+        parts = (
+            sheet.part(is_over_restored(one, anatomy, sheet.points_mm))
+            for sheet, one in zip(whole_case.media, implants, strict=True)
+        )
         found[name] = whole_case, replace(whole_case, media=tuple(parts))
     return found
-
-
-def where_meshed(sheet: Sheet, stent: Stent, anatomy: Anatomy) -> Sheet:
-    """The sheet only where OpenFOAM meshes struts."""
-    chosen = is_over_restored(stent, anatomy, sheet.points_mm)
-    return Sheet(**{one.name: getattr(sheet, one.name)[chosen] for one in fields(Sheet)})
 
 
 def computed(

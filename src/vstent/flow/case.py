@@ -53,6 +53,10 @@ class Sheet:
         freeze(self, "points_mm normals", np.float64, (n, 3))
         freeze(self, " ".join(column.name for column in fields(self)[2:]), np.float64, (n,))
 
+    def part(self, chosen: Bools) -> "Sheet":
+        """Return the sheet at the chosen samples (p,)."""
+        return Sheet(**{column.name: getattr(self, column.name)[chosen] for column in fields(self)})
+
 
 @dataclass(frozen=True, eq=False)
 class Target:

@@ -164,6 +164,21 @@ def test_a_border_across_along_or_oblique_to_the_flow_changes_nothing(
     assert fits[0][0] == pytest.approx(fits[1][0], rel=0.02)
 
 
+def test_a_border_beside_a_neck_moves_no_blood_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a vessel that is its own mirror image, with more of one side refined: no blood in the sac moves sideways."""
+    refine(monkeypatch, lambda at: np.minimum(0.3 - np.abs(at[:, 0] - 1.4), at[:, 1] + 0.3))
+    artery = phantoms.tube(length_mm=30.0, radius_mm=1.3)
+    beside = np.array([1.0, 0.0, 0.0])
+    phantom = phantoms.with_sac(artery, abscissa_mm=15.0, width_mm=2.6, neck_mm=2.0, direction=beside)
+    whole = trace(Vessel(phantoms.phantom_surface(phantom, edge_mm=0.25)))
+    anatomy = restore(trim(whole, upstream_mm=4.0, downstream_mm=4.0))
+    field = simulate_case(flow_case(anatomy, (), FlowSettings(numerics=Numerics(cell_size_mm=0.1, close_up=True))))
+    coarsest = field.levels[0]
+    inside = anatomy.aneurysms[0].sac.signed_distance(coarsest.centers_mm) < 0
+    velocity_m_s = coarsest.velocity_m_s[inside]
+    assert np.abs(velocity_m_s[:, 1].mean()) < 0.015 * np.linalg.norm(velocity_m_s, axis=1).mean()
+
+
 def of_narrow(size_mm: float, *, close_up: bool) -> State:
     """Return the flow after 40 checks in a tube with 12 fine cells across."""
     settings = FlowSettings(inflow_mL_s=0.6, numerics=Numerics(cell_size_mm=size_mm, close_up=close_up))

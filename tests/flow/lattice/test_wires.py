@@ -10,10 +10,10 @@ from vstent import phantoms
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
-from vstent.deployment.struts import united
+from vstent.deployment.struts import is_over_restored, united
 from vstent.flow import domain, simulation
 from vstent.flow.case import FlowCase
-from vstent.flow.lattice import levels, stepping
+from vstent.flow.lattice import stepping
 from vstent.flow.lattice.cost import estimate
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.reading import exchanged, force_N
@@ -28,7 +28,7 @@ CELL_MM = 0.075
 
 @pytest.fixture(scope="module")
 def resolved() -> FlowCase:
-    """A short tube with a sac, and a device with wide struts over its neck."""
+    """A short tube with a sac, and the part of a device with wide struts that lies over its neck."""
     tube = phantoms.with_sac(
         phantoms.tube(length_mm=24.0, radius_mm=1.4),
         abscissa_mm=12.0,
@@ -42,7 +42,8 @@ def resolved() -> FlowCase:
     stent = vstent.deploy(design, anatomy).stent
     numerics = Numerics(cell_size_mm=CELL_MM, wires="resolved")
     case = flow_case(anatomy, (stent,), FlowSettings(inflow_mL_s=1.0, numerics=numerics))
-    return replace(case, vessel=trim(whole, upstream_mm=5.0, downstream_mm=3.0))
+    media = tuple(sheet.part(is_over_restored(stent, anatomy, sheet.points_mm)) for sheet in case.media)
+    return replace(case, vessel=trim(whole, upstream_mm=5.0, downstream_mm=3.0), media=media)
 
 
 def test_the_blood_is_the_lumen_without_the_wires(resolved: FlowCase) -> None:
@@ -89,36 +90,32 @@ def test_blood_drags_wires_along(resolved: FlowCase, flow: State) -> None:
 
 
 def test_wires_too_thin_for_the_grid_are_walls_on_a_finer_level(resolved: FlowCase) -> None:
-    """The coarser level has the screen; both agree on the flow through it and on the mass at their border."""
+    """Of a wire that is a wall no band resists any more."""
     case = replace(resolved, numerics=replace(resolved.numerics, cell_size_mm=2 * CELL_MM))
     assert domain.wires_of(case, 2 * CELL_MM) is None
     state = LatticeBoltzmann(2 * CELL_MM).init(case, None)
     coarse, fine = state.levels
     assert len(coarse.screen.cell) > 0
-    assert not len(coarse.links.of_wires)
     assert not len(fine.screen.cell)
+    assert not len(coarse.links.of_wires)
     assert len(fine.links.of_wires) > 1000
     made, foretold = sum(len(level.domain.cells) for level in state.levels), estimate(case).cells
     assert made == pytest.approx(foretold, rel=0.25)
     assert state.kept == (state,)
 
 
-@pytest.mark.parametrize("finer", [1, 2])
+@pytest.mark.parametrize(("finer", "most"), [(1, 0.01), (2, 0.07)])
 def test_wires_on_a_finer_level_are_those_of_the_uniform_fine_grid(
-    resolved: FlowCase, flow: State, finer: int, monkeypatch: pytest.MonkeyPatch
+    resolved: FlowCase, flow: State, finer: int, most: float
 ) -> None:
-    """Without the screen beside the neck, which the fine grid has not: force within 3 %, the rest within 5 %.
-
-    The coarsest grid has 19 or 9 cells across the artery.
-    """
-    monkeypatch.setattr(levels, "BESIDE_NECK", 100.0)
-    case = replace(resolved, media=(), numerics=replace(resolved.numerics, cell_size_mm=2**finer * CELL_MM))
+    """The force as well: within 3 %. The coarsest grid has 19 or 9 cells across the artery."""
+    case = replace(resolved, numerics=replace(resolved.numerics, cell_size_mm=2**finer * CELL_MM))
     engine = LatticeBoltzmann(2**finer * CELL_MM)
     state = engine.init(case, None)
     assert len(state.levels) == 1 + finer
     while len(state.history) < 16:
         stepping.step(state)
-    np.testing.assert_allclose(state.history[-1], flow.history[-1], rtol=0.05)
+    np.testing.assert_allclose(state.history[-1], flow.history[-1], rtol=most)
     force, wanted = force_N(state.levels[-1]), force_N(flow)
     assert np.linalg.norm(force - wanted) < 0.03 * np.linalg.norm(wanted)
     between = state.interface

@@ -39,8 +39,9 @@ from scipy.spatial import cKDTree
 from vstent.deployment.struts import thickness_mm
 from vstent.errors import FlowError
 from vstent.flow import domain as domains
-from vstent.flow.case import FlowCase
+from vstent.flow.case import FlowCase, Sheet
 from vstent.flow.domain import Domain, Window
+from vstent.flow.drag import BREADTH
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.setup import Crossings, Grid, address, behind, thickest
 from vstent.geometry.surface import Surface
@@ -60,9 +61,6 @@ RIM: Final = 3
 """Number of layers added around the cells to be refined."""
 OPENING_CELLS: Final = 2
 """Distance in cells to which a refined part approaches the end of an opening, which only the coarsest level has."""
-GROUP: Final = 24
-"""Extent in cells of the pieces of a border in which crossed mass is compared. In smaller ones the cells beside the
-wall, whose faces differ on both grids, disturb the profile."""
 LACK_PART: Final = 0.15
 """Under-relaxation factor with which the mass returned to the coarser level follows what crossed."""
 PUSH_PART: Final = 0.05
@@ -219,6 +217,23 @@ def _walls(case: FlowCase) -> Surface:
     return Surface(case.wires.vertices_mm, case.wires.faces[is_near])
 
 
+def beside_walls(case: FlowCase, blood_mm: Floats) -> FlowCase:
+    """Return a case without the part of its media whose wires are walls of a grid with cells at (n, 3).
+
+    The bands of wires reach beyond the border of a finer level, where they would resist once more.
+    """
+    wires, tree = case.wires, cKDTree(blood_mm)
+    assert wires is not None
+
+    def left(sheet: Sheet) -> Sheet:
+        nearest_mm, away_mm, _ = wires.closest(sheet.points_mm)
+        is_wall = tree.query(nearest_mm)[0] < thickness_mm(wires)
+        is_own = away_mm < 0.5 * BREADTH * sheet.spacing_mm + thickness_mm(wires)
+        return sheet.part(~(is_wall & is_own & sheet.normals.any(axis=1)))
+
+    return replace(case, media=tuple(left(one) for one in case.media))
+
+
 def near_wires(case: FlowCase, grid: Domain, finest_mm: float) -> Bools:
     """Return whether each cell (n,) lies near wires that finer levels take as walls, the finest with this spacing."""
     wires, reach_mm = _walls(case), _reach_mm(case, grid.cell_size_mm, finest_mm)
@@ -324,8 +339,10 @@ def _coupled(coarse: Grid, fine: Grid, layer_of_wide: Ints, layer_of_fine: Ints)
     sides = layer_of_wide >= OWN_LAYER, layer_of_fine >= OWN_LAYER
     links = [_crossing(grid, is_own) for grid, is_own in zip((coarse, fine), sides, strict=True)]
     beside = np.unique(links[0][1])
-    group = _pieces(wide.cells[beside])
-    groups = int(group.max(initial=0)) + 1
+    near = cKDTree(wide.cells[beside]).query_pairs(1.8, output_type="ndarray")
+    joins = coo_matrix((np.ones(len(near)), near.T), shape=(len(beside),) * 2)
+    count, group = connected_components(joins, directed=False)
+    groups = max(1, count)
     nearest = cKDTree(wide.centers_mm[beside]) if len(beside) else None
 
     def group_at(places_mm: Floats) -> Ints:
@@ -342,10 +359,17 @@ def _coupled(coarse: Grid, fine: Grid, layer_of_wide: Ints, layer_of_fine: Ints)
         side = is_own + 2 * (0 if grid.side is None else grid.side)
         grids.append(replace(grid, crossings=(*grid.crossings, border[-1]), side=side.astype(np.int32)))
         ahead_mm = grid.domain.centers_mm[inside] - grid.domain.centers_mm[outside]
-    # Of a closed piece the directions cancel: it has no flow rate to keep.
     size_mm = np.bincount(of_link, np.linalg.norm(ahead_mm, axis=1), groups)
     total_mm = np.stack([np.bincount(of_link, along_mm, groups) for along_mm in ahead_mm.T], axis=1)
     normal = total_mm / np.maximum(size_mm, 1e-300)[:, None]
+    # Through the only border of a refined part nothing flows in sum.
+    inside, outside, _ = links[0]
+    is_part = np.zeros(wide.index.shape, dtype=bool)
+    is_part[tuple(wide.cells[sides[0]].T)] = True
+    part = np.zeros(groups, dtype=int)
+    number, _ = ndimage.label(is_part, np.ones((3, 3, 3)))
+    part[group[np.searchsorted(beside, outside)]] = number[tuple(wide.cells[inside].T)]
+    normal[np.bincount(part)[part] == 1] = 0.0
 
     def carried(read: Grid, written: Grid, target: Ints) -> Stencil:
         of_cell = group_at(written.domain.centers_mm[target])
@@ -377,24 +401,6 @@ def _coupled(coarse: Grid, fine: Grid, layer_of_wide: Ints, layer_of_fine: Ints)
 def _shares(group: Ints, size: Floats, groups: int) -> Floats:
     """Return the part (c,) of each cell in the total size of its group."""
     return size / np.bincount(group, size, groups)[group]
-
-
-def _pieces(cells: Ints) -> Ints:
-    """Return the group (c,) of each cell of a border: connected cells, halved until they extend over `GROUP` cells."""
-    near = cKDTree(cells).query_pairs(1.8, output_type="ndarray")
-    joins = coo_matrix((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=(len(cells), len(cells)))
-    group: Ints = np.asarray(connected_components(joins, directed=False)[1], dtype=np.int32)
-    left = list(range(int(group.max(initial=-1)) + 1))
-    while left:
-        members = np.flatnonzero(group == left[-1])
-        extent = np.ptp(cells[members], axis=0)
-        if extent.max() <= GROUP:
-            left.pop()
-            continue
-        along = cells[members, extent.argmax()]
-        group[members[along > np.median(along)]] = group.max() + 1
-        left.append(int(group.max()))
-    return group
 
 
 def _crossing(grid: Grid, is_own: Bools) -> tuple[Ints, Ints, Ints]:

@@ -27,6 +27,7 @@ from vstent.flow.lattice.levels import (
     WIDTH,
     Interface,
     Stencil,
+    beside_walls,
     refined,
     sizes_mm,
 )
@@ -73,6 +74,9 @@ def build(
     else:
         begun = start
     grids = _grids(case, cell_size_mm)
+    finest, last = grids[-1]
+    if last is not None and domains.wires_of(case, finest.domain.cell_size_mm):
+        case = beside_walls(case, finest.domain.centers_mm[last.is_trusted])
     levels = [_level(case, grid, check_s, WIDTH**depth * pace, begun, kept) for depth, (grid, _) in enumerate(grids)]
     state = levels[0]
     for coarse, fine, (_, between) in zip(levels[:-1], levels[1:], grids[1:], strict=True):
@@ -88,8 +92,9 @@ def _level(case: FlowCase, grid: Grid, check_s: float, pace: Ints, start: FlowFi
     scales = Scales(domain.cell_size_mm * M_PER_MM, check_s / int(pace[0]), case.blood)
     scales = replace(scales, odd_rate=odd_rate(scales.relaxation_steps))
     links = build_links(case, grid, scales)
-    of_screen = replace(case, media=()) if domains.wires_of(case, domain.cell_size_mm) else case
-    screen = build_screen(of_screen, domain, addressing, scales)
+    if domains.wires_of(case, domain.cell_size_mm):
+        case = beside_walls(case, domain.centers_mm)
+    screen = build_screen(case, domain, addressing, scales)
     place, groups = grid.groups
     slots = 2 * sum(len(one.cell) for one in grid.crossings)
     f, stride = np.zeros(behind(addressing) + slots, dtype=np.float32), addressing.stride
@@ -101,7 +106,7 @@ def _level(case: FlowCase, grid: Grid, check_s: float, pace: Ints, start: FlowFi
             moments = d3q19.moments(f, stride, links.place[links.start[k] : links.start[k + 1]])
             links.openings[k, d3q19.MEMORY] = moments[:, 0].mean()
     return State(
-        case=of_screen,
+        case=case,
         domain=domain,
         addressing=addressing,
         scales=scales,
