@@ -157,6 +157,7 @@ def test_why_a_treatment_is_not_deployed_stays_in_view(artery, tmp_path):
 
         def refuse(route):
             asked.append(route.request.url)
+            page.evaluate("() => dispatchEvent(new Event('hashchange'))")  # the page is drawn anew meanwhile
             route.fulfill(status=422, json={"detail": "These stents do not fit."})
 
         page.route("**/deployment", refuse)
