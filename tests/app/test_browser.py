@@ -111,7 +111,7 @@ def test_of_a_treatment_with_two_implants_both_are_shown_and_each_is_moved(arter
         page.get_by_role("button", name="1. Silk").click()
         assert in_time(page, lambda: place_of(page, "distal") == outer)
         playwright.expect(page.locator(".section-words")).to_contain_text("Free device")
-        assert page.locator(".section .cut.device").count() == 2
+        playwright.expect(page.locator(".section .cut.device")).to_have_count(2)
 
 
 @pytest.mark.system
@@ -157,6 +157,7 @@ def test_why_a_treatment_is_not_deployed_stays_in_view(artery, tmp_path):
 
         def refuse(route):
             asked.append(route.request.url)
+            page.evaluate("() => dispatchEvent(new Event('hashchange'))")  # the page is drawn anew meanwhile
             route.fulfill(status=422, json={"detail": "These stents do not fit."})
 
         page.route("**/deployment", refuse)
@@ -180,6 +181,7 @@ def test_a_basket_is_chosen_and_pulled_out_of_the_sac(artery, tmp_path):
         choices = view["choices"] | {"treatments": []}
         client.put("/api/cases/phantom/choices", json={"revision": view["revision"], "choices": choices})
         step(page, "Treatment")
+        playwright.expect(page.locator(".chosen")).to_have_count(0)
         page.locator("[data-key=device-web_sl]").check()
         playwright.expect(page.locator(".panel .hint")).to_have_text("Sizes of baskets and coils are not ranked.")
         step(page, "Deploy")
@@ -360,7 +362,7 @@ def test_the_blood_follows_a_device_that_is_dragged(artery, tmp_path):
         assert page.locator(".chip", has_text="Live flow").get_attribute("aria-pressed") == "true"
         assert in_time(page, lambda: ramps_are_true(page, 2))  # gap to the wall, speed
         drag(page, ".handle.distal .knob", -60, 0)
-        assert page.locator(".live.stale").count() == 1
+        playwright.expect(page.locator(".live.stale")).to_have_count(1)
         page.locator(".handle.distal").focus()
         for _ in range(7):  # 2 mm each, until the neck is free
             page.keyboard.press("PageDown")
@@ -382,6 +384,7 @@ def test_sizes_are_sorted_compared_and_saved_as_a_picture(artery, tmp_path):
         rows.first.wait_for()
         playwright.expect(page.locator(".work")).to_be_hidden(timeout=120 * SECOND)
         found = client.get(f"/api/cases/{client.get('/api/cases').json()['cases'][0]['id']}/ranking").json()["rows"]
+        playwright.expect(page.locator(".ranking-head")).to_contain_text(f"{len(found)} of {len(found)} deployed")
         page.get_by_role("button", name="Length", exact=True).click()
         playwright.expect(page.locator("th[aria-sort=ascending]")).to_have_text("Length ↑")
         lengths = [float(words.split()[0]) for words in rows.locator("td:nth-child(6)").all_inner_texts()]
@@ -522,7 +525,7 @@ def trim_and_draw_the_neck(client, page):
 
 
 def still(knob):
-    """Wait until it is there and lies still: the view glides from step to step."""
+    """Wait until it is there and lies still."""
     knob.wait_for(state="visible")
     knob.element_handle().wait_for_element_state("stable")
 

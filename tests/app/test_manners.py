@@ -101,7 +101,8 @@ def definitions_are_shown(client, page):
         redrawn(client, page)
         playwright.expect(page.locator(":focus")).to_have_text(words, use_inner_text=True)
     page.keyboard.press("Escape")
-    page.locator(".sheet .term.defined").first.click()
+    # As a touch does: a pointer that rests shows the definition by itself, and its click takes that away.
+    page.locator(".sheet .term.defined").first.dispatch_event("click")
     playwright.expect(tip).to_be_visible()
     page.keyboard.press("Escape")
 
@@ -120,7 +121,7 @@ WATCHED = """() => {
 def redrawn(client, page):
     """Draw every part anew, by a view that another window saves."""
     page.evaluate("document.querySelector('.numbers').firstChild.isOld = true")
-    case = client.get("/api/cases/analytic").json()
+    case = analytic(client)
     views = case["choices"]["views"]
     view = {
         "name": f"Another {len(views)}",
@@ -132,7 +133,8 @@ def redrawn(client, page):
     client.put(
         "/api/cases/analytic/choices", json={"revision": case["revision"], "choices": choices}
     ).raise_for_status()
-    assert in_time(page, lambda: page.evaluate("!document.querySelector('.numbers').firstChild.isOld"))
+    page.locator(".kept-view", has_text=view["name"]).wait_for(state="attached")
+    assert page.evaluate("!document.querySelector('.numbers').firstChild.isOld")
 
 
 def find_again_where_it_is_offered(client, page):
@@ -141,15 +143,26 @@ def find_again_where_it_is_offered(client, page):
     page.keyboard.press("Tab")
     page.wait_for_selector(".step.stale:nth-child(2)")
     step(page, "Treatment")
-    with page.expect_request(lambda request: request.method == "POST" and request.url.endswith("/jobs/anatomy")):
+
+    def overtaken(route):
+        """The answer comes when the job that it tells of is cancelled."""
+        answer = route.fetch()
+        playwright.expect(page.locator(".work")).to_be_visible()
+        client.delete("/api/cases/analytic/jobs")
+        playwright.expect(page.locator(".work")).to_be_hidden()
+        route.fulfill(response=answer)
+
+    page.route("**/jobs/anatomy", overtaken)
+    with page.expect_response("**/jobs/anatomy"):
         page.get_by_role("button", name="Find it again").click()
+    page.unroute("**/jobs/anatomy")
+    page.wait_for_timeout(300)
     heading(page, "Treatment")
-    client.delete("/api/cases/analytic/jobs")
 
 
 def a_new_key_opens_the_page_where_it_was(client, page):
     """A server that was started again has another key: the page explains it, open or loaded anew."""
-    page.wait_for_selector(".work", state="hidden")
+    playwright.expect(page.locator(".work")).to_be_hidden()
     page.context.clear_cookies()
     # Not by the pointer: a request that was under way may have opened the dialog over the steps by now.
     page.locator(".stepper").get_by_role("button", name="Deploy").dispatch_event("click")
@@ -164,6 +177,57 @@ def a_new_key_opens_the_page_where_it_was(client, page):
     playwright.expect(page.locator("#token")).to_be_focused()
     page.fill("#token", app_case.TOKEN)
     page.get_by_role("button", name="Open the page").click()
+
+
+@pytest.mark.system
+def test_what_is_done_while_the_page_is_redrawn_is_not_lost(client):
+    """A click, a text that is no number yet, and a device looked for by keys."""
+    with browsing(client, 1024, 768) as page:
+        open_case(page)
+        page.locator(".sheet .row").first.wait_for()
+        for place, title in (
+            (".step[data-key=vessel]", "Vessel"),
+            (".panel .next", "Sac and parent"),
+            (".panel .next", "Treatment"),
+        ):
+            press(page, place, lambda: redrawn(client, page))
+            heading(page, title)
+        playwright.expect(page.locator(".chosen b")).to_have_text(["Silk", "Enterprise"])
+        press(page, ".chosen label.device >> nth=1", lambda: redrawn(client, page))
+        assert in_time(page, lambda: [one["name"] for one in analytic(client)["choices"]["treatments"]] == ["silk"])
+        page.get_by_label("Add a device to Silk").focus()
+        page.keyboard.type("enter")
+        redrawn(client, page)
+        page.keyboard.press("Enter")
+        playwright.expect(page.locator(".implant > span")).to_have_text(["1. Silk proposed", "2. Enterprise proposed"])
+        step(page, "Flow")
+        field = page.locator("#field-inflow")
+        field.press_sequentially("3.")
+        redrawn(client, page)
+        page.keyboard.type("2")
+        redrawn(client, page)
+        page.keyboard.press("Home")
+        page.keyboard.press("ArrowRight")
+        redrawn(client, page)
+        page.keyboard.type("1")
+        playwright.expect(field).to_have_value("31.2")
+        redrawn(client, page)
+        page.keyboard.press("Tab")
+        assert in_time(page, lambda: analytic(client)["choices"]["flow"]["inflow_mL_s"] == 31.2)
+
+
+def analytic(client):
+    return client.get("/api/cases/analytic").json()
+
+
+def press(page, place, meanwhile):
+    """Click where something else happens between press and release."""
+    page.locator(place).scroll_into_view_if_needed()
+    box = page.locator(place).bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.down()
+    meanwhile()
+    page.mouse.up()
 
 
 def cases_are_renamed_and_deleted(client, page):

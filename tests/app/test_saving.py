@@ -9,7 +9,7 @@ import app_case
 import numpy as np
 import pytest
 from browsing import SECOND, browsing, in_time, needs_browser, playwright, step
-from test_image_step import analytic_case
+from test_image_step import analytic_case, laid
 
 from vstent.angiography.view import axes_of
 
@@ -21,14 +21,8 @@ WIDTH_PX = round(WIDTH_MM / 25.4 * DPI)
 
 def saved(page, name, kind):
     """Bytes of a view as the page saves it, 90 mm wide at 150 dpi."""
-    form, button = page.locator(".save-form"), page.locator(f".save[aria-label$=': {name}']")
-
-    def is_asked():  # a panel that is drawn anew between press and release takes the click away
-        if not form.is_visible():
-            button.click()
-        return form.is_visible()
-
-    assert in_time(page, is_asked)
+    page.locator(f".save[aria-label$=': {name}']").click()
+    form = page.locator(".save-form")
     form.locator("[data-key=format]").select_option(kind)
     form.locator("[data-key=dpi]").select_option(str(DPI))
     form.locator("input").fill(str(WIDTH_MM))
@@ -103,8 +97,10 @@ def test_any_view_is_saved_as_png_and_as_svg(client):
 
 
 def slices_are_saved(page):
+    page.locator(".sheet .row").first.wait_for()  # the slices turn to the neck as soon as it is known
     step(page, "Image")
     page.locator(".slice[data-outlines*=lumen]").nth(2).wait_for()
+    laid(page)
     root = alike(page, "slices")
     assert len(list(root.iter(f"{SVG}image"))) == 3
     assert {"A", "P", "R", "L", "H", "F"} < set(words(root))
@@ -137,6 +133,13 @@ def arm(page):
     return np.array([int(primary) * (-1 if side == "RAO" else 1), int(secondary) * (-1 if tilt == "CAU" else 1)])
 
 
+TURNED_IN_FLIGHT = """() => {
+    document.querySelector(".carm").dispatchEvent(new Event("change"));
+    document.querySelector(".viewer-area").dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight" }));
+}"""
+"""Begins to glide to the angles that are typed, and turns 0.12 rad further about the picture's upward direction."""
+
+
 def turn_arm(page, words, shown):
     """Type angles, and wait until the view has glided there."""
     page.fill(".carm", words)
@@ -146,17 +149,16 @@ def turn_arm(page, words, shown):
 
 def views_are_kept_and_turned_by_angles(client, page):
     """Angles are those of the films; a view that is saved comes back, after a reload as well."""
+    page.emulate_media(reduced_motion="no-preference")
     page.get_by_role("button", name="Left", exact=True).click()
     playwright.expect(page.locator(".carm")).to_have_value("LAO 90 CRA 0")
-    turn_arm(page, "RAO 20, CAU 15", "RAO 20 CAU 15")
-    page.wait_for_timeout(300)  # the last degree of the glide
-    page.locator(".viewer-area").focus()
-    page.keyboard.press("ArrowRight")  # 0.12 rad about the upward direction of the picture
+    page.fill(".carm", "RAO 20, CAU 15")
+    page.evaluate(TURNED_IN_FLIGHT)
     right, _, toward = axes_of(*np.radians([-20, -15]))
     x, y, z = np.cos(0.12) * toward - np.sin(0.12) * right
     wanted = np.degrees([np.arctan2(x, -y), np.arcsin(z)])
-    playwright.expect(page.locator(".carm")).not_to_have_value("RAO 20 CAU 15")
-    np.testing.assert_allclose(arm(page), wanted, atol=0.51)
+    playwright.expect(page.locator(".carm")).not_to_have_value("RAO 20, CAU 15")
+    assert in_time(page, lambda: np.allclose(arm(page), wanted, rtol=0, atol=0.51))
     turned = page.locator(".carm").input_value()
     page.get_by_role("button", name="Save this view").click()
     page.fill("#ask-field", "Working")
@@ -173,8 +175,8 @@ def views_are_kept_and_turned_by_angles(client, page):
     page.fill(".carm", "up")
     page.keyboard.press("Enter")
     playwright.expect(page.locator(".toast.problem")).to_contain_text("is not a C-arm direction")
+    page.emulate_media(reduced_motion="reduce")
     page.get_by_role("button", name="Profile", exact=True).click()
-    page.wait_for_timeout(800)
 
 
 def ranges_are_chosen(client, page):

@@ -18,7 +18,7 @@ needs_browser = pytest.mark.skipif(
 
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking"]
 SECOND = 1000
-playwright.expect.set_options(timeout=60 * SECOND)  # a busy machine takes its time
+playwright.expect.set_options(timeout=120 * SECOND)  # a busy machine takes its time
 
 
 def browsing(client, width=1280, height=720, **options):
@@ -36,7 +36,8 @@ def at(address, width=1280, height=720, expected=None, **options):
     complaints: list[str] = []
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=BROWSER, args=FLAGS)
-        page = browser.new_page(viewport={"width": width, "height": height}, **options)
+        # Without gliding views: what is to be pulled or clicked on the scene would move away.
+        page = browser.new_page(viewport={"width": width, "height": height}, reduced_motion="reduce", **options)
         page.set_default_timeout(120 * SECOND)
         page.on("console", lambda message: complaints.append(message.text))
         page.on("pageerror", lambda error: complaints.append(str(error)))
@@ -65,9 +66,9 @@ def step(page, title):
     page.locator(".stepper").get_by_role("button", name=title, exact=False).click()
 
 
-def in_time(page, is_so, seconds=30):
+def in_time(page, is_so, seconds=60):
     """Ask until it is so; a message on the page may be that of something else."""
     until = time.monotonic() + seconds
-    while not is_so() and time.monotonic() < until:
+    while not (found := is_so()) and time.monotonic() < until:
         page.wait_for_timeout(100)
-    return is_so()
+    return found

@@ -175,8 +175,8 @@ class Page {
 
   take(view) {
     const before = this.view;
-    // An event sent before the answer to a choice describes the state before it.
-    if (before?.id === view.id && view.revision < before.revision) return;
+    // Answers and events overtake each other: one sent later describes what is newer.
+    if (before?.id === view.id && (view.revision < before.revision || (view.revision === before.revision && view.sent_s < before.sent_s))) return;
     this.view = view;
     document.title = `${view.name} · vstent`;
     this.caseName.textContent = view.name;
@@ -478,7 +478,7 @@ class Page {
     if (!treatment || this.asksForAneurysm) return;
     this.picture.moved = (event) => this.deploying.look(this.deploying.line.under(event, null));
     const key = JSON.stringify([treatment, implant.id, this.colour, this.view.anatomy, this.view.choices.straightening, this.view.job?.kind === "place"]);
-    if (this.shownTreatment !== key || !(this.measures[treatment.name] || this.undeployed)) {
+    if (this.shownTreatment !== key || !(this.measures[treatment.name] || this.undeployed || this.deploying.whole.isBusy)) {
       this.shownTreatment = key;
       this.deploying.show(treatment.name, implant.id);
     }

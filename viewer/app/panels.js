@@ -430,14 +430,14 @@ function adding(page, treatment) {
   if (!canBuild(page, treatment) || implants.length >= MOST_IMPLANTS) return [];
   const options = page.catalogue.filter(({ use }) => use !== "basket" && (use !== "coils" || signOf(treatment) === "+")).map(({ key, name }) => make("option", { value: key }, [name]));
   const add = () => rebuild(page, treatment, (now) => [...now, ...withDevice(box.value).implants.map((implant) => ({ ...implant, placing: {} }))]);
-  let isKeyed = false; // by arrow keys and letters each device on the way is selected: then Enter adds
+  // By arrow keys and letters each device on the way is selected: then Enter adds.
   const onKeyDown = ({ key }) => {
-    isKeyed = true;
+    box.dataset.isKeyed = "yes";
     if (key === "Enter" && box.value) add();
   };
   const words = `Add a device to ${page.names.treatment(treatment.name)}`;
   const first = make("option", { value: "" }, ["+ Add a device"]);
-  const handlers = { onChange: () => isKeyed || add(), onKeyDown, onPointerDown: () => (isKeyed = false) };
+  const handlers = { onChange: () => box.dataset.isKeyed || add(), onKeyDown, onPointerDown: () => delete box.dataset.isKeyed };
   const box = make("select", { className: "inside", title: "By keys: select, then Enter", ariaLabel: words, data: { key: `inside-${treatment.name}` }, ...handlers }, [first, ...options]);
   return [make("div", { className: "implant" }, [box])];
 }

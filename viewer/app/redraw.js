@@ -1,23 +1,40 @@
 // Drawing a part of the page anew: what has the focus, what is typed, unfolded and explained is found again in it.
 import { giveTip, tipOwner } from "./tips.js";
 
-/** Fields with text that is not committed yet, and those of them into which it was written when they were drawn anew. */
+/** Fields with text that is not committed yet, and those of them that were taken over when they were drawn anew. */
 const [typed, carried] = [new WeakSet(), new WeakSet()];
+const CLICKED = "button, a, input, label, summary, tr";
 let isChanging = false;
+let pressed = null; // by the mouse
+let isAnew = false; // since then
 
 addEventListener("input", ({ target }) => typed.add(target));
 addEventListener("change", committed, { capture: true });
 addEventListener("focusout", ({ target }) => commit(target));
 addEventListener("keyup", ({ key, target }) => key === "Enter" && commit(target));
 
+addEventListener("pointerdown", press, { capture: true });
+addEventListener("pointerup", release, { capture: true });
+
+function press({ target, button, pointerType }) {
+  [pressed, isAnew] = [button === 0 && pointerType === "mouse" ? target.closest(CLICKED) : null, false];
+}
+
+/** Click what was drawn anew between press and release: a browser does not. */
+function release({ target }) {
+  if (isAnew && pressed?.contains(target)) pressed.click();
+  pressed = null;
+}
+
 /** Note a committed text; a browser also commits what is typed into a field that is taken away, and that is too early. */
 function committed(event) {
   if (isChanging) return event.stopImmediatePropagation();
+  if (event.target.dataset.isKeyed) return; // a list in which keys look for a word
   typed.delete(event.target);
   carried.delete(event.target);
 }
 
-/** Commit the text that was written into a field: the browser commits only what was typed into it. */
+/** Commit the text of a field that was taken over: for the browser it is committed already. */
 function commit(field) {
   if (!isChanging && carried.has(field)) field.dispatchEvent(new Event("change", { bubbles: true }));
 }
@@ -33,22 +50,18 @@ function finder(box, element) {
   return () => (box.contains(element) ? element : same()[place]);
 }
 
-/** Give the focus to what was drawn in place of an element, with the text typed into it; else to the heading of the box. */
+/**
+ * Give the focus to what was drawn in place of an element; else to the heading of the box.
+ * A field with text that is not committed yet stays itself: only it knows what is no number yet, and where the cursor is.
+ */
 function refocus(box, before, after) {
   const heading = box.querySelector("h2");
   if (!after && heading) heading.tabIndex = -1;
-  (after ?? heading)?.focus({ preventScroll: true });
-  if (after === before || !typed.has(before)) return;
-  if (after) carry(before, after);
-  else before.dispatchEvent(new Event("change")); // the field is not there any more
-}
-
-/** Write text that is not committed yet into the field drawn in place of its own, with the cursor where it was. */
-function carry({ value, selectionStart, selectionEnd }, field) {
-  field.value = value;
-  typed.add(field);
-  carried.add(field);
-  if (selectionStart != null) field.setSelectionRange(selectionStart, selectionEnd);
+  const isTyped = typed.has(before);
+  if (isTyped && after) carried.add(before);
+  if (isTyped && after !== before) after?.replaceWith(before);
+  (isTyped && after ? before : (after ?? heading))?.focus({ preventScroll: true });
+  if (isTyped && !after) before.dispatchEvent(new Event("change")); // the field is not there any more
 }
 
 /** Change what is in `box` and return the focus, the unfolded details and the definition to the elements that correspond. */
@@ -58,6 +71,7 @@ export function keeping(box, change) {
   const find = (element) => (box.contains(element) ? finder(box, element) : () => element);
   const focused = box !== activeElement && box.contains(activeElement) && find(activeElement);
   const described = owner && find(owner);
+  const held = pressed && box.contains(pressed) && find(pressed);
   const unfolded = [...box.querySelectorAll("details[open] > summary")].map(find);
   isChanging = true;
   try {
@@ -66,6 +80,7 @@ export function keeping(box, change) {
     isChanging = false;
   }
   for (const summary of unfolded) summary()?.parentElement.toggleAttribute("open", true);
+  if (held) [pressed, isAnew] = [held(), true];
   if (focused) refocus(box, activeElement, focused());
   if (focused || described) giveTip(described?.());
 }

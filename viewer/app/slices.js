@@ -202,7 +202,7 @@ export class Slices {
   }
 
   outlined({ view, index, found, answer: { manifest, buffer } }) {
-    if (found !== this.outlineKey) return;
+    if (found !== this.outlineKey || index !== view.index) return;
     const outlines = { index, found };
     for (const [name, block] of Object.entries(manifest.segments)) outlines[name] = pathOf(numbers(buffer, block));
     if (manifest.wires) outlines.wires = numbers(buffer, manifest.wires);
@@ -301,7 +301,7 @@ export class Slices {
 
   /** The box that is chosen, as opposite corners in LPS mm, or null. */
   setCrop(corners) {
-    if (!this.scan) return;
+    if (!this.scan || this.isPulled) return;
     const found = corners?.map((corner) => toIndex(this.file.affine_mm, corner).map(Math.round));
     this.crop = found ? [0, 1].map((end) => found[0].map((_, axis) => Math[end ? "max" : "min"](found[0][axis], found[1][axis]))) : null;
     this.bar.renderTools();
@@ -314,12 +314,13 @@ export class Slices {
     const box = this.cropBox.map((corner) => [...corner]);
     const [least, most] = end ? [box[0][axis] + 7, this.scan.shape[axis] - 1] : [0, box[1][axis] - 7];
     box[end][axis] = Math.min(Math.max(Math.round(place), least), most);
-    this.crop = box;
+    [this.crop, this.isPulled] = [box, true];
     this.paint();
     this.imaging.redraw();
   }
 
   letCropGo() {
+    this.isPulled = false;
     this.bar.renderTools();
     const rounded = (corner) => toMm(this.file.affine_mm, corner).map((x) => Number(x.toFixed(3)));
     this.page.choose({ crop_mm: this.isCropped ? this.crop.map(rounded) : null });

@@ -14,7 +14,7 @@ export class Handling {
     area.addEventListener("pointerdown", (event) => this.take(event));
     area.addEventListener("pointermove", (event) => this.move(event));
     area.addEventListener("pointerup", (event) => this.leave(event));
-    area.addEventListener("pointercancel", () => (this.hand = null));
+    area.addEventListener("pointercancel", () => (this.hand = null, slices.isPulled = false));
     area.addEventListener("pointerleave", () => slices.scan && slices.point(null));
     area.addEventListener("contextmenu", (event) => event.preventDefault());
     area.addEventListener("dblclick", () => slices.tool === "cross" && slices.maximise(view));

@@ -75,6 +75,7 @@ export class Orbit {
   fly(to) {
     const from = { target: this.target.clone(), turned: this.turned.clone(), distance: this.distance };
     const started = performance.now();
+    // By Infinity it lands at once.
     this.flight = (now) => {
       const t = Math.min(1, (now - started) / 350);
       const s = t * t * (3 - 2 * t);
@@ -111,6 +112,7 @@ export class Orbit {
       "wheel",
       (event) => {
         event.preventDefault();
+        this.flight?.(Infinity);
         this.zoom(Math.exp(event.deltaY * (event.deltaMode ? 0.04 : 0.0012)));
       },
       { passive: false },
@@ -141,6 +143,7 @@ export class Orbit {
     const step = 0.12;
     const arrows = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
     const arrow = arrows[event.key];
+    this.flight?.(Infinity);
     if (arrow && event.shiftKey) this.move(arrow[0] * 30, arrow[1] * 30, height);
     else if (arrow) this.turn(arrow[0] * step, arrow[1] * step);
     else if (event.key === "+" || event.key === "=") this.zoom(1 / 1.15);

@@ -3,6 +3,7 @@
 import json
 import tempfile
 import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -98,6 +99,7 @@ class Workspace:
             "name": state.name,
             "folder": str(case.folder),
             "revision": state.revision,
+            "sent_s": time.monotonic(),
             "choices": state.choices.model_dump(mode="json"),
             "unseen": state.unseen() if state.former else [],
             "steps": statuses(state, job.step if job else "", lost_steps(case.folder, state)),
