@@ -22,7 +22,8 @@ differently. Blood that is set anew in each exchange would have to be accelerate
 across a tube of six coarse cells would take the pressure that falls over two cells. Momentum normal to the border is
 therefore added to the cells that are set. It is integrated from what remains: on the coarser grid the mass that crosses
 too much, on the finer one the difference of pressure between both grids in the layer between. It is bounded
-(`MOST_PUSHED`), because wires that cross a border keep such a difference.
+(`MOST_PUSHED`), because wires that cross a border keep such a difference. Where a refined part has a single border,
+nothing flows through it in sum, and no momentum is added: beside a neck it would stir the sac.
 """
 
 from dataclasses import dataclass, replace
