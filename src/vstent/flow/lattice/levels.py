@@ -131,7 +131,7 @@ class Interface:
     lack: Floats
     """(g,) mass taken from the cells beside the border before every pair of steps of the coarser grid."""
     between: tuple[Ints, Ints, Ints]
-    """Cells of both grids in the layer that neither sets (see `exchange.jumps`)."""
+    """Cells of both grids in the layer that neither sets, where momentum is added (see `exchange.jumps`)."""
     push: Floats
     """(2, g) momentum into the finer grid that is added to the cells set on the finer and on the coarser grid."""
     is_trusted: Bools
@@ -380,6 +380,7 @@ def _coupled(coarse: Grid, fine: Grid, layer_of_wide: Ints, layer_of_fine: Ints)
     in_wide = wide.cells_at(fine.domain.centers_mm)
     corner = fine.domain.cell_size_mm * (np.indices((WIDTH,) * 3).reshape(3, -1).T - 0.5)
     middle: Ints = np.flatnonzero(layer_of_wide == OWN_LAYER - 1)
+    middle = middle[normal[group_at(wide.centers_mm[middle])].any(axis=1)]
     finer = np.stack([fine.domain.cells_at(wide.centers_mm[middle] + offset) for offset in corner], axis=1)
     middle, finer = middle[(finer >= 0).all(axis=1)], finer[(finer >= 0).all(axis=1)]
     coupling = Interface(
