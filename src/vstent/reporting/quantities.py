@@ -48,7 +48,7 @@ NOTHING = 1e-9
 FINEST_MM = 0.1
 """Length below which micrometers are its last digit."""
 LEAST_PERCENT = 1e-4
-"""Percentage below which only its order is told."""
+"""Percentage below which only this bound is written."""
 RATIO = "_ratio"
 """Suffix of the key of a ratio: value with the device over value without it."""
 MOST_RATIO = 10.0
