@@ -71,7 +71,7 @@ def validation(options: list[str]) -> int:
         cases = list(ET.parse(report).getroot().iter("testcase"))
     modules: dict[str, list[ET.Element]] = {}
     for case in cases:
-        modules.setdefault(case.get("classname", "").removeprefix("tests."), []).append(case)
+        modules.setdefault(case.get("classname", "").rsplit(".", 1)[-1], []).append(case)
     for name, found in modules.items():
         keep("validation", name, " ".join(["make validation", *options]), _results(found))
     return code
