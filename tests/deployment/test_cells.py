@@ -147,5 +147,5 @@ def test_a_sketch_lifts_the_same_cells():
     from vstent.deployment.deploy import propose_landing
 
     drawn = sketch(ready, propose_landing(ENTERPRISE, bend(), SIZE))
-    assert drawn.gap_mm == pytest.approx(deployed().wall_gap_mm, abs=0.05)
+    assert drawn.wall_gap_mm == pytest.approx(deployed().wall_gap_mm, abs=0.05)
     assert np.linalg.norm(drawn.stent.nodes_mm - deployed().stent.nodes_mm, axis=2).max() < 0.1

@@ -196,6 +196,7 @@ def test_provenance_is_whole(page):
     [
         ("neck_inflow_mL_s", 0.41234, "0.412 mL/s"),
         ("coverage_fraction", 0.2816, "28.2 %"),
+        ("contrast_balance_error_fraction", 1.49e-7, "below 0.0001 %"),
         ("bend_angle_rad", math.pi / 2, "90.0 °"),
         ("aspect_ratio", 1.234, "1.23"),
         ("iterations_count", 7.0, "7"),

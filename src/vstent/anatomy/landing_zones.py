@@ -42,12 +42,17 @@ def neck_points_mm(anatomy: Anatomy) -> Floats:
     return triangles.compact(neck.vertices_mm, neck.faces)[0]
 
 
-def landing_diameters_mm(anatomy: Anatomy) -> tuple[float, float]:
-    """Return the mean diameters of the parent artery in the landing zones before and after the neck, in mm."""
+def zone_diameters_mm(anatomy: Anatomy) -> tuple[Floats, Floats]:
+    """Return diameters (51,) of the parent artery along the landing zones before and after the neck, in mm."""
     proximal_mm, distal_mm = neck_span_mm(anatomy)
     first_mm, last_mm = anatomy.parent.own_mm
     before = np.linspace(max(first_mm, proximal_mm - ZONE_MM), max(first_mm, proximal_mm), 51)
     after = np.linspace(min(last_mm, distal_mm), min(last_mm, distal_mm + ZONE_MM), 51)
-    diameter_mm = 2 * anatomy.parent.section_radius_mm
-    first, second = (np.interp(zone, anatomy.parent.axis.abscissa_mm, diameter_mm).mean() for zone in (before, after))
-    return float(first), float(second)
+    along_mm, diameter_mm = anatomy.parent.axis.abscissa_mm, 2 * anatomy.parent.section_radius_mm
+    return np.interp(before, along_mm, diameter_mm), np.interp(after, along_mm, diameter_mm)
+
+
+def landing_diameters_mm(anatomy: Anatomy) -> tuple[float, float]:
+    """Return the mean diameters of the parent artery in the landing zones before and after the neck, in mm."""
+    before_mm, after_mm = zone_diameters_mm(anatomy)
+    return float(before_mm.mean()), float(after_mm.mean())

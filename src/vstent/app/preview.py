@@ -47,12 +47,11 @@ from vstent.flow.simulation import foretell_cost
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import PARENT, Anatomy, Opening
 from vstent.io.archive import load_data
-from vstent.kernels import triangles
+from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Floats
 from vstent.plan.bands import gap_bands
 from vstent.reporting.packing import message
 from vstent.reporting.scene import (
-    STEEL_COLOUR,
     LineLayer,
     MeshLayer,
     anatomy_layers,
@@ -66,6 +65,7 @@ from vstent.reporting.scene import (
     view_of,
     views_of,
     wire_layer,
+    wires_of,
 )
 from vstent.reporting.uncertainty import band_rows, how_sure
 from vstent.study.folder import CACHE
@@ -234,7 +234,7 @@ class Preview:
             found = self.deployment(treatment, implant)
             measured = partial(node_coverage, found.stent)
             coverage = partial(self._of_implant, "coverage", treatment, implant, measured)
-            layers.append(_wires(pane, found.stent, found.wall_gap_mm, colour, coverage))
+            layers.append(_wires(pane, found, colour, coverage))
         return layers
 
     def _drawn(self, pane: str, treatment: Treatment, colour: Colour) -> list[MeshLayer | LineLayer]:
@@ -491,7 +491,7 @@ class Preview:
                 else:
                     drawn[one.id] = self.deployment(treatment, one)
             self._show(tuple(one.stent for one in drawn.values()))
-            wires = [_wires(pane, *_seen(one), colour, partial(_covered, one.stent)) for one in drawn.values()]
+            wires = [_wires(pane, one, colour, partial(_covered, one.stent)) for one in drawn.values()]
             layers, yields = self._yielded(pane, self.shown, [*wires])
             place = self._place(_implant(treatment, implant), drawn[implant].stent, drawn[implant])
             return message(layers, scales_of(layers, self.anatomy), treatment=pane, implant=implant, **place, **yields)
@@ -658,23 +658,21 @@ def _opening_colour(opening: Opening) -> tuple[float, float, float]:
 def _disc(number: int, opening: Opening) -> MeshLayer:
     """Return a disc with the area of an opening, slightly outside it."""
     angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
-    first = np.cross(opening.normal, np.eye(3)[np.argmin(np.abs(opening.normal))])
-    first /= np.linalg.norm(first)
+    first = curves.any_perpendicular(opening.normal)
     second = np.cross(opening.normal, first)
     ring = np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second)
     center = opening.center_mm + 0.05 * opening.normal
     points = np.concatenate([center[None], center + 0.5 * opening.diameter_mm * ring])
     around = np.arange(40)
     faces = np.stack([np.zeros(40, int), 1 + around, 1 + (around + 1) % 40], axis=1)
-    surface = Surface(points, faces)
-    return MeshLayer(f"opening {number}", "", _opening_colour(opening), surface)
+    return MeshLayer(f"opening {number}", "", _opening_colour(opening), Surface(points, faces))
 
 
-def _wires(name: str, stent: Stent, gap_mm: Floats, colour: Colour, coverage: Callable[[], Floats]) -> LineLayer:
+def _wires(name: str, found: Sketch | Deployment, colour: Colour, coverage: Callable[[], Floats]) -> LineLayer:
     """Return the wires of a device, colored by the values at the nearest nodes (rows, columns)."""
+    stent, gap_mm = found.stent, found.wall_gap_mm
     if isinstance(stent, Coils):
-        half_mm = stent.wire_diameter_um / 2000
-        return LineLayer("wires", name, STEEL_COLOUR, stent.wire_points_mm, stent.wire_starts, half_mm)
+        return wires_of("wires", name, stent)
     of_node = gap_mm
     if colour == "coverage":
         of_node = 100 * coverage()
@@ -683,27 +681,13 @@ def _wires(name: str, stent: Stent, gap_mm: Floats, colour: Colour, coverage: Ca
     some = stent.wire_points_mm[::NEIGHBOURS]
     near = cKDTree(stent.nodes_mm.reshape(-1, 3)).query(some)[1]
     values = np.repeat(of_node.ravel()[near], NEIGHBOURS)[: len(stent.wire_points_mm)]
-    return LineLayer(
-        "wires",
-        name,
-        STEEL_COLOUR,
-        stent.wire_points_mm,
-        stent.wire_starts,
-        stent.wire_diameter_um / 2000,
-        scale=colour,
-        values=values,
-    )
+    return wires_of("wires", name, stent, scale=colour, values=values)
 
 
 def _covered(stent: Stent) -> Floats:
     """Return the metal coverage (rows, columns) by the formula, from the diameter of every row."""
     of_row = [coverage_fraction(stent.design, stent.size, float(d)) for d in stent.row_diameter_mm]
     return np.broadcast_to(np.array(of_row)[:, None], stent.nodes_mm.shape[:2])
-
-
-def _seen(found: Sketch | Deployment) -> tuple[Stent, Floats]:
-    """Return a device that is drawn, and its gaps (rows, columns) to the wall, in mm."""
-    return found.stent, found.gap_mm if isinstance(found, Sketch) else found.wall_gap_mm
 
 
 def _is_sketched(treatment: Treatment, implant: Implant) -> bool:

@@ -25,7 +25,7 @@ from vstent.devices.catalogue import find_design
 from vstent.devices.design import Basket, Coil, Size
 from vstent.devices.stent import Coils, Deployment, Stent
 from vstent.errors import LandingError
-from vstent.geometry.vessel import Anatomy, Aneurysm, NeckPlane
+from vstent.geometry.vessel import Anatomy, Aneurysm
 from vstent.kernels import curves, rods
 from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.units import MM_PER_UM, counted
@@ -225,7 +225,7 @@ class _Filling:
         inner_mm = room.points_mm(room.distance_mm < -0.7 * wound_mm)
         height_mm = (inner_mm - plane.center_mm) @ plane.normal
         aside_mm = curves.lengths(inner_mm - plane.center_mm - height_mm[:, None] * plane.normal)
-        is_near = (height_mm < 0.5 * height_mm.max(initial=0.0)) & (aside_mm < 0.7 * _half_width_mm(plane))
+        is_near = (height_mm < 0.5 * height_mm.max(initial=0.0)) & (aside_mm < 0.7 * np.sqrt(plane.area_mm2 / np.pi))
         self.inner_mm = inner_mm[height_mm > 0]
         self.tips_mm, self.plane = inner_mm[is_near if is_near.any() else height_mm > 0], plane
 
@@ -241,6 +241,7 @@ class _Filling:
         a coil that kinks the part before the kink counts, as a shorter coil.
         """
         entering, begin = round(size.length_mm / self.wound_mm), self.count
+        most = min(entering, len(self.rods.x) - begin - 4)
         before = [values.copy() for values in self.rods]
         best: list[Floats] = []
         best_count = begin
@@ -248,9 +249,7 @@ class _Filling:
             self._restore(before, begin)
             direction = self._place(begin, is_free=number > 0)
             self._curl(begin, entering + 3, 0.5 * size.free_diameter_mm, is_framing=is_framing)
-            count = rods.advance(
-                self.rods, self.laws, begin + 2, self.room, DRAG, STEPS, direction, min(entering, self._space(begin))
-            )[0]
+            count = rods.advance(self.rods, self.laws, begin + 2, self.room, DRAG, STEPS, direction, most)[0]
             self.count, is_kinked = count - 1, True  # without the node that is still in the catheter
             for _ in range(3):
                 if self.count - begin < LEAST_NODES:
@@ -286,10 +285,6 @@ class _Filling:
         """Return the axes (p, 3) of all coils, and the first point (c + 1,) of each, followed by p."""
         last = np.flatnonzero(~self.rods.is_segment[: self.count])
         return self.rods.x[: self.count], np.r_[0, last + 1].astype(np.int32)
-
-    def _space(self, begin: int) -> int:
-        """Return the number of nodes for which there is memory."""
-        return len(self.rods.x) - begin - 4
 
     def _restore(self, state: Sequence[Floats], count: int) -> None:
         """Go back to an earlier state."""
@@ -380,11 +375,6 @@ def _room(aneurysm: Aneurysm, inside: Sequence[Stent], wound_mm: float) -> Room:
         to_stent_mm = np.minimum(stent.contour.closed.signed_distance(points_mm), to_wires_mm)
         distance_mm[is_inner] = np.maximum(distance_mm[is_inner], wire_mm + ROUNDED * room.spacing_mm - to_stent_mm)
     return room._replace(distance_mm=distance_mm)
-
-
-def _half_width_mm(plane: NeckPlane) -> float:
-    """Return the radius of the circle with the area of a neck, in mm."""
-    return float(np.sqrt(plane.area_mm2 / np.pi))
 
 
 def measure_coils(anatomy: Anatomy, coils: Coils) -> Measures:

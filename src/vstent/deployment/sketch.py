@@ -69,7 +69,7 @@ class Sketch:
 
     stent: Stent
     """The device."""
-    gap_mm: Floats
+    wall_gap_mm: Floats
     """(rows, columns) gap between the outer face of the device and the wall, in mm."""
     proximal_band_mm: tuple[float, float]
     """Arc lengths of the proximal end, in mm, for the smallest and the largest plausible diameters of the artery."""

@@ -108,25 +108,31 @@ class Strands:
 
 
 @dataclass(frozen=True, eq=False)
-class Braid:
-    """A tube braided from round wires of two hands, with further strands where it has them."""
+class _Listed:
+    """What the catalogue states of a device of any family."""
 
     key: str
     """Short lower-case name."""
     name: str
     """Name as the maker writes it."""
+    maker: str = field(default="", kw_only=True)
+    """Manufacturer."""
+    facts: tuple[Fact, ...] = field(default=(), kw_only=True)
+    """Source and confidence of every number."""
+    ranges: tuple[Range, ...] = field(default=(), kw_only=True)
+    """Range of every number."""
+
+
+@dataclass(frozen=True, eq=False)
+class Braid(_Listed):
+    """A tube braided from round wires of two hands, with further strands where it has them."""
+
     wires: tuple[tuple[int, float], ...]
     """Groups of wires: (count, diameter in um)."""
     braid_angle_rad: float
     """Angle between wire and axis at the free diameter, in rad."""
     sizes: tuple[Size, ...]
     """Available sizes."""
-    maker: str = ""
-    """Manufacturer."""
-    facts: tuple[Fact, ...] = ()
-    """Source and confidence of every number."""
-    ranges: tuple[Range, ...] = ()
-    """Range of every number."""
     strands: tuple[Strands, ...] = ()
     """Outer layer of a dual-layer device, or radiopaque strands beside the wires of the mesh."""
     has_closed_ends: bool = False
@@ -283,13 +289,9 @@ class Basket(Braid):
 
 
 @dataclass(frozen=True, eq=False)
-class LaserCut:
+class LaserCut(_Listed):
     """A tube cut into zigzag rings whose crowns are joined: all of them (closed cells) or some (open cells)."""
 
-    key: str
-    """Short lower-case name."""
-    name: str
-    """Name as the maker writes it."""
     n_columns: int
     """Columns of the lattice: struts around one ring, twice the number of cells around the device."""
     strut_width_um: float
@@ -300,12 +302,6 @@ class LaserCut:
     """Angle between strut and axis at the free diameter, in rad."""
     sizes: tuple[Size, ...]
     """Available sizes."""
-    maker: str = ""
-    """Manufacturer."""
-    facts: tuple[Fact, ...] = ()
-    """Source and confidence of every number."""
-    ranges: tuple[Range, ...] = ()
-    """Range of every number."""
     joined_crowns: tuple[str, ...] = ()
     """Which crowns between two rings are joined, for an open-cell device: one text for each row of crowns, ``1`` for a
     joined and ``0`` for a free crown. The texts are repeated around and along the device. Empty: all are joined."""
@@ -383,29 +379,19 @@ class LaserCut:
 
 
 @dataclass(frozen=True, eq=False)
-class Coil:
+class Coil(_Listed):
     """A line of detachable coils for sacs: a thin wire wound to a long spring that curls to loops when it is free.
 
     Its sizes are the diameter of the free loops x the length of the coil. It has no mesh, and the numbers that all
     designs have are those of none.
     """
 
-    key: str
-    """Short lower-case name."""
-    name: str
-    """Name as the maker writes it."""
     wound_diameter_um: float
     """Outer diameter of the spring, in um."""
     stock_wire_um: float
     """Diameter of the wire that is wound, in um."""
     sizes: tuple[Size, ...]
     """Available sizes."""
-    maker: str = ""
-    """Manufacturer."""
-    facts: tuple[Fact, ...] = ()
-    """Source and confidence of every number."""
-    ranges: tuple[Range, ...] = ()
-    """Range of every number."""
     kind: Literal["coil"] = field(default="coil", init=False)
     """Device family."""
 

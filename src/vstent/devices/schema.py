@@ -199,7 +199,7 @@ class _Device(_Strict):
     """Flared ends, or a free diameter that tapers along the device."""
 
     def shared(self, beyond_mm: float = 0.0) -> dict[str, Any]:
-        """Return the fields that the designs of both families have.
+        """Return the fields that the designs of all families have, and the numbers that are fields of this one.
 
         The ends of the device that the label does not count are `beyond_mm` long.
         """
@@ -210,7 +210,9 @@ class _Device(_Strict):
             along = self.free_profile.along(free_mm, length_mm + beyond_mm) if self.free_profile else ()
             sizes.append(Size(diameter_mm, length_mm, free_mm, free_profile_mm=along))
         noted = list(self._noted())
+        own = {name: getattr(self, name) for name in type(self).model_fields if name not in _Device.model_fields}
         return {
+            **{name: entry.value for name, entry in own.items() if isinstance(entry, _Stated)},
             "key": self.key,
             "name": self.name,
             "maker": self.maker,
@@ -254,7 +256,6 @@ class _Braid(_Device):
             strands.append(Strands(layer.count.value, layer.diameter_um.value, "outside", layer.beyond_mm.value))
         return Braid(
             wires=tuple((group.count.value, group.diameter_um.value) for group in self.wires),
-            braid_angle_rad=self.braid_angle_rad.value,
             strands=tuple(strands),
             has_closed_ends=self.closed_ends is not None and self.closed_ends.value,
             **self.shared(2 * layer.beyond_mm.value if layer else 0.0),
@@ -272,9 +273,7 @@ class _Basket(_Braid):
     def design(self) -> Design:
         """Return the basket."""
         wires = tuple((group.count.value, group.diameter_um.value) for group in self.wires)
-        angle_rad, exponent = self.braid_angle_rad.value, self.exponent.value
-        is_cup = self.cup is not None and self.cup.value
-        return Basket(wires=wires, braid_angle_rad=angle_rad, exponent=exponent, is_cup=is_cup, **self.shared())
+        return Basket(wires=wires, is_cup=self.cup is not None and self.cup.value, **self.shared())
 
 
 class _LaserCut(_Device):
@@ -299,15 +298,7 @@ class _LaserCut(_Device):
 
     def design(self) -> Design:
         """Return the laser-cut device."""
-        return LaserCut(
-            n_columns=self.n_columns.value,
-            strut_width_um=self.strut_width_um.value,
-            strut_thickness_um=self.strut_thickness_um.value,
-            cell_angle_rad=self.cell_angle_rad.value,
-            joined_crowns=tuple(self.joined_crowns.value) if self.joined_crowns else (),
-            crown_gap_um=self.crown_gap_um.value if self.crown_gap_um else 0.0,
-            **self.shared(),
-        )
+        return LaserCut(joined_crowns=tuple(self.joined_crowns.value) if self.joined_crowns else (), **self.shared())
 
 
 class _Coil(_Device):
@@ -319,8 +310,7 @@ class _Coil(_Device):
 
     def design(self) -> Design:
         """Return the line of coils."""
-        wound_um, stock_um = self.wound_diameter_um.value, self.stock_wire_um.value
-        return Coil(wound_diameter_um=wound_um, stock_wire_um=stock_um, **self.shared())
+        return Coil(**self.shared())
 
 
 class _Catalogue(_Strict):

@@ -111,7 +111,11 @@ def rank_flows(
     told = [
         _with_flow(one, results[None], results[one], criteria) if one in results else one for one in ranking.candidates
     ]
-    return replace(ranking, candidates=tuple(_by_retention(told)))
+    # Candidates with a retention are ordered among the places that they have.
+    places = [place for place, one in enumerate(told) if RETENTION in one.measures]
+    for place, one in zip(places, ordered(told[place] for place in places), strict=True):
+        told[place] = one
+    return replace(ranking, candidates=tuple(told))
 
 
 def _stored(found: Stored, candidate: Candidate | None, measured: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
@@ -123,14 +127,6 @@ def _stored(found: Stored, candidate: Candidate | None, measured: Callable[[], M
 def is_finished(result: Mapping[str, Any] | None, has_contrast: bool) -> bool:
     """Return whether a result holds what is asked for."""
     return result is not None and ("error" in result or not has_contrast or "contrast" in result)
-
-
-def _by_retention(candidates: list[Candidate]) -> list[Candidate]:
-    """Return candidates of which those with a retention are ordered among the places that they have."""
-    places = [place for place, one in enumerate(candidates) if RETENTION in one.measures]
-    for place, one in zip(places, ordered(candidates[place] for place in places), strict=True):
-        candidates[place] = one
-    return candidates
 
 
 def chosen_of(ranking: Ranking, count: int) -> list[Candidate]:

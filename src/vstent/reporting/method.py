@@ -24,7 +24,6 @@ from vstent.reporting.figures import Plate, Shot
 from vstent.reporting.node_rule import NodeRule
 from vstent.reporting.scene import (
     INK_COLOUR,
-    STEEL_COLOUR,
     WALL_COLOUR,
     Implants,
     LineLayer,
@@ -38,6 +37,7 @@ from vstent.reporting.scene import (
     scales_of,
     titled,
     view_of,
+    wires_of,
 )
 from vstent.reporting.thinning import some_frames, thin_frames, thin_surface
 from vstent.units import counted
@@ -127,16 +127,7 @@ def free_device(design: Design, size: Size) -> Stent:
 
 def wire_layer(stent: Stent) -> LineLayer:
     """Return the wires of a device, colored by their diameter in um."""
-    return LineLayer(
-        "free",
-        "",
-        STEEL_COLOUR,
-        stent.wire_points_mm,
-        stent.wire_starts,
-        stent.wire_diameter_um / 2000,
-        scale="wire_diameter",
-        values=stent.wire_diameter_um[stent.point_wires],
-    )
+    return wires_of("free", "", stent, scale="wire_diameter", values=stent.wire_diameter_um[stent.point_wires])
 
 
 def _trimming(whole: Vessel, scene: Scene) -> Plate:

@@ -4,9 +4,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, Final, NamedTuple
 
-import numpy as np
-
-from vstent.anatomy.landing_zones import ZONE_MM, neck_span_mm
+from vstent.anatomy.landing_zones import ZONE_MM, zone_diameters_mm
 from vstent.anatomy.morphology import morphology
 from vstent.anatomy.restore.paths import on_path
 from vstent.angiography.view import fitted
@@ -157,16 +155,8 @@ def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str,
         ("Deployed length", f"{stent.deployed_length_mm:.1f} mm {ends(metrics, 'deployed_length_mm')}".rstrip()),
     ]
     anatomy = on_path(anatomy, stent.path)
-    first_mm, last_mm = anatomy.parent.own_mm
-    proximal_mm, distal_mm = neck_span_mm(anatomy)
-    zones_mm = {
-        "Proximal": (max(first_mm, proximal_mm - ZONE_MM), max(first_mm, proximal_mm)),
-        "Distal": (min(last_mm, distal_mm), min(last_mm, distal_mm + ZONE_MM)),
-    }
-    for end, zone_mm in zones_mm.items():
-        inside = np.linspace(*zone_mm, 51)
-        diameters = 2 * np.interp(inside, anatomy.parent.axis.abscissa_mm, anatomy.parent.section_radius_mm)
-        words = f"{diameters.min():.2f} to {diameters.max():.2f} mm"
+    for end, diameters_mm in zip(("Proximal", "Distal"), zone_diameters_mm(anatomy), strict=True):
+        words = f"{diameters_mm.min():.2f} to {diameters_mm.max():.2f} mm"
         rows.append((f"{end} landing zone, {ZONE_MM:g} mm: smallest and largest diameter", words))
     keys = {
         "neck_to_proximal_end_mm": "Length beyond the neck, proximal",

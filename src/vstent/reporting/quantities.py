@@ -47,6 +47,8 @@ NOTHING = 1e-9
 """Magnitude below which a value is shown as 0, because only rounding errors are that small."""
 FINEST_MM = 0.1
 """Length below which micrometers are its last digit."""
+LEAST_PERCENT = 1e-4
+"""Percentage below which only its order is told."""
 RATIO = "_ratio"
 """Suffix of the key of a ratio: value with the device over value without it."""
 MOST_RATIO = 10.0
@@ -192,6 +194,8 @@ def format_value(key: str, value: Any) -> str:
     if unit == "mm" and abs(value) < FINEST_MM:
         number = f"{abs(value):.3f}".rstrip("0").rstrip(".")
     number = f"−{number}" if value < 0 and number != "0" else number
+    if unit == "%" and NOTHING <= abs(value) * factor < LEAST_PERCENT:
+        number = f"below {LEAST_PERCENT:g}"
     return f"{number}\u202f{unit}" if unit else number
 
 

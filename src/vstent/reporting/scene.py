@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -206,6 +206,12 @@ def scene_of(
 def own_layers(pane: str, anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
     """Return the layers of an artery that has yielded to a treatment, which replace those as scanned in a pane."""
     return [replace(one, pane=pane) for one in anatomy_layers(anatomy) if one.id in OWN]
+
+
+def wires_of(name: str, pane: str, stent: Stent, **values: Any) -> LineLayer:
+    """Return the wires of a device as a layer, with the fields `scale` and `values` where they are colored."""
+    half_mm = stent.wire_diameter_um / 2000
+    return LineLayer(name, pane, STEEL_COLOUR, stent.wire_points_mm, stent.wire_starts, half_mm, **values)
 
 
 def wire_layer(name: str, stent: Stent) -> LineLayer:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vstent.anatomy.landing_zones import neck_span_mm
 from vstent.anatomy.read import read_vessel
 from vstent.anatomy.restore.paths import on_path
 from vstent.anatomy.restore.restore import restore
@@ -71,7 +72,7 @@ def compare_followup(
     axis, other = anatomy.parent.axis, after.parent.axis
     ends_mm = stent.proximal_abscissa_mm, stent.distal_abscissa_mm
     # The axis keeps its length, so that arc lengths lead from the middle of the neck to the ends of the device.
-    middle_mm, at_mm = _middle_mm(anatomy), _middle_mm(after)
+    middle_mm, at_mm = (float(np.mean(neck_span_mm(one))) for one in (anatomy, after))
     if not after.aneurysms:
         at_mm = float(other.nearest_abscissa_mm(pose.of(axis.at(np.array([middle_mm]))))[0])
     after_mm = ends_mm[0] - middle_mm + at_mm, ends_mm[1] - middle_mm + at_mm
@@ -98,17 +99,10 @@ def _outside_mm(anatomy: Anatomy, stent: Stent) -> Floats:
     return points_mm[(at_mm < first_mm) | (at_mm > last_mm)]
 
 
-def _middle_mm(anatomy: Anatomy) -> float:
-    """Return the abscissa of the middle of the neck, or of the artery without one, in mm."""
-    if not anatomy.aneurysms:
-        return 0.5 * anatomy.parent.axis.length_mm
-    return float(np.mean(anatomy.parent.span_mm(anatomy.aneurysms[0])))
-
-
 def _artery(anatomy: Anatomy, vessel: Vessel, pose: Pose) -> Anatomy:
     """Return the restored artery after the treatment, between the ends of the one before."""
     axis = anatomy.parent.axis
-    first_mm, middle_mm, last_mm = pose.of(axis.at(np.array([0.0, _middle_mm(anatomy), axis.length_mm])))
+    first_mm, middle_mm, last_mm = pose.of(axis.at(np.array([0.0, np.mean(neck_span_mm(anatomy)), axis.length_mm])))
     reach_mm = {"upstream_mm": axis.length_mm, "downstream_mm": axis.length_mm}
     traced = trim(trace(vessel, inlet_mm=first_mm), at_mm=middle_mm, **reach_mm)
     return restore(traced, outlet_mm=last_mm)

@@ -473,10 +473,8 @@ def measure_study(
         treatments[name]["quality"] = _quality(case, field, flow) | computation_of(of_flow, field)
     for treatment in settings.treatments:
         for implant in treatment.implants if treatment.name in implants else ():
-            measures, deployment = (
-                treatments[treatment.name]["implants"][implant.id],
-                implants[treatment.name][implant.id],
-            )
+            measures = treatments[treatment.name]["implants"][implant.id]
+            deployment = implants[treatment.name][implant.id]
             if not isinstance(deployment.stent.design, Basket | Coil):
                 measures["bands"] = bands_of(anatomy, deployment, measures, implant)
     _add(treatments, "uncertainty", varied)

@@ -13,6 +13,7 @@ from vstent.anatomy.trim import trim
 from vstent.deployment.struts import is_over_restored, united
 from vstent.flow import domain, simulation
 from vstent.flow.case import FlowCase
+from vstent.flow.indices import indices
 from vstent.flow.lattice import stepping
 from vstent.flow.lattice.cost import estimate
 from vstent.flow.lattice.engine import LatticeBoltzmann
@@ -20,7 +21,9 @@ from vstent.flow.lattice.reading import exchanged, force_N
 from vstent.flow.lattice.state import State
 from vstent.flow.problem import flow_case
 from vstent.flow.settings import FlowSettings, Numerics
+from vstent.flow.simulation import simulate_case
 from vstent.geometry.vessel import Vessel
+from vstent.kernels.arrays import Floats
 from vstent.units import duration
 
 CELL_MM = 0.075
@@ -121,6 +124,25 @@ def test_wires_on_a_finer_level_are_those_of_the_uniform_fine_grid(
     between = state.interface
     assert between is not None
     assert np.abs(between.lack).max() < 1e-4
+
+
+@pytest.mark.validation
+def test_what_a_flow_with_walls_ends_with_does_not_depend_on_the_screen_that_it_began_from(resolved: FlowCase) -> None:
+    """Begun from a screen of half and of twice the resistance, whose flows differ by a tenth: within 1 %."""
+    keys = ("neck_inflow_mL_s", "mean_sac_velocity_m_s", "mean_sac_wss_Pa")
+    found: dict[str, list[Floats]] = {"screen": [], "resolved": []}
+    for times in (0.5, 2.0):
+        resistances = ("normal_resistance_Pa_s_m", "tangential_resistance_Pa_s_m", "inertial_loss")
+        changed = ({name: times * getattr(sheet, name) for name in resistances} for sheet in resolved.media)
+        media = tuple(replace(sheet, **values) for sheet, values in zip(resolved.media, changed, strict=True))
+        for wires, values in found.items():
+            numerics = replace(resolved.numerics, cell_size_mm=2 * CELL_MM, wires=wires)
+            field = simulate_case(replace(resolved, media=media, numerics=numerics))
+            assert field.is_converged
+            of_flow = indices(field, resolved.sac, resolved.ostium)
+            values.append(np.array([of_flow[key] for key in keys]))
+    assert (np.abs(found["screen"][0] / found["screen"][1] - 1) > 0.1).all()
+    np.testing.assert_allclose(*found["resolved"], rtol=0.01)
 
 
 def test_open_wires_are_decided_by_time_and_the_reason_is_told(
