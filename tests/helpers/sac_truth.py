@@ -53,9 +53,9 @@ def anatomy_of(phantom: phantoms.Phantom) -> Anatomy:
     return restore(trace(Vessel(phantoms.phantom_surface(phantom))))
 
 
-def scanned_anatomy_of(phantom: phantoms.Phantom, voxel_mm: float) -> Anatomy:
+def scanned_anatomy_of(phantom: phantoms.Phantom, voxel_mm: float, seed: int = 1) -> Anatomy:
     scanner = Scanner(voxel_mm=voxel_mm, blur_mm=0.8 * voxel_mm)
-    return restore(trace(segment(phantoms.scan(phantom, np.random.default_rng(1), scanner=scanner))))
+    return restore(trace(segment(phantoms.scan(phantom, np.random.default_rng(seed), scanner=scanner))))
 
 
 def relative_errors(anatomy: Anatomy, phantom: phantoms.Phantom) -> tuple[np.ndarray, np.ndarray]:

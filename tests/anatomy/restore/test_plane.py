@@ -14,8 +14,10 @@ from vstent.anatomy.restore.plane import plane_sac
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.restore.tubes import tubes_of
 from vstent.anatomy.trace import trace
+from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Aneurysm, Vessel
-from vstent.phantoms import Phantom, Sac, bifurcation, torus_arc, tube, with_sac
+from vstent.kernels import triangles
+from vstent.phantoms import Phantom, Sac, bifurcation, torus_arc, tube, with_branch, with_sac
 
 Z = np.array([0.0, 0.0, 1.0])
 OBLIQUE = np.array([0.6, 0.8, 0.0])
@@ -121,6 +123,30 @@ def test_a_lobe_is_never_the_sac_without_a_word(half_angle_rad: float, height_mm
     (sac,) = anatomy.aneurysms
     is_whole = sac.sac.volume_mm3 == pytest.approx(is_sac.mean() * 5.2**3, rel=0.12)
     assert is_whole or any("is outside the sac: a lobe of it" in note for note in anatomy.notes)
+
+
+def test_a_branch_that_touches_the_sac_does_not_move_its_plane() -> None:
+    alone = with_sac(tube(length_mm=24), abscissa_mm=12, direction=OBLIQUE)
+    # The branch overlaps the sac by 0.25 mm, 2.7 mm above the artery.
+    both = with_branch(alone, abscissa_mm=15.9, direction=OBLIQUE)
+    lumen, tubes = phantoms.phantom_surface(both, edge_mm=0.3), tubes_of([both.parent, *both.branches])
+    n_edges = len(np.unique(np.sort(triangles.directed_edges(lumen.faces), axis=1), axis=0))
+    n_openings, n_handles = 3, 1
+    assert len(lumen.vertices_mm) - n_edges + len(lumen.faces) == 2 - n_openings - 2 * n_handles
+    expected = sac_of("on a tube")
+    assert expected.plane is not None
+    for seed in range(3):
+        shift_mm = 1e-4 * np.random.default_rng(seed).normal(size=lumen.vertices_mm.shape)
+        moved = Surface(lumen.vertices_mm + shift_mm, lumen.faces)
+        sac = plane_sac(moved, tubes, find_bulges(moved, tubes)[0])
+        assert sac is not None
+        assert sac.plane is not None
+        assert sac.plane.area_mm2 == pytest.approx(expected.plane.area_mm2, rel=0.005)
+        assert sac.plane.normal @ expected.plane.normal > np.cos(np.radians(0.5))
+        np.testing.assert_allclose(sac.plane.center_mm, expected.plane.center_mm, atol=0.03)
+        # The contact is closed half a radius of the branch above its wall.
+        assert 0 < sac.sac.volume_mm3 / expected.sac.volume_mm3 - 1 < 0.02
+        assert sac.sac.boundary_loops == ()
 
 
 @pytest.mark.validation

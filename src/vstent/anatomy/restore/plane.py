@@ -19,7 +19,7 @@ from vstent.anatomy.restore.neck import BRANCH_SHARE
 from vstent.anatomy.restore.tubes import Tubes
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Aneurysm, NeckPlane
-from vstent.kernels import curves, sections, triangles
+from vstent.kernels import curves, sections, topology, triangles
 from vstent.kernels.arrays import Floats, Ints
 
 REACH: Final = 2.0
@@ -75,6 +75,7 @@ def plane_sac(lumen: Surface, tubes: Tubes, bulge: Bulge) -> Aneurysm | None:
     fields = np.column_stack([lumen.vertices_mm, height / radius, away_mm])
     near = (away_mm < REACH * radius)[lumen.faces].all(axis=1)
     fields, faces = triangles.compact(fields, triangles.faces_at(lumen.vertices_mm, lumen.faces[near], bulge.dome_mm))
+    fields, faces = _without_contacts(fields, faces)
     artery_mm = float(np.median(tubes.radius_mm[tubes.height_mm(bulge.foot_mm)[1]]))
     for thin_mm in (THIN * artery_mm, np.inf):
         wall = _wall(fields, faces, thin_mm, bulge)
@@ -91,6 +92,25 @@ def plane_sac(lumen: Surface, tubes: Tubes, bulge: Bulge) -> Aneurysm | None:
         plane = NeckPlane(normal, neck.vertices_mm[:-1], band_mm2, float(share))
         return Aneurysm(sac, neck, plane.rim_mm, plane)
     return None
+
+
+def _without_contacts(fields: Floats, faces: Ints) -> tuple[Floats, Ints]:
+    """Return the wall with the bulge closed where it touches an artery that it also reaches through its foot."""
+    # Through such a contact every part with the dome would reach an open artery, and no plane at the foot would close
+    # it. A branch that arises from the sac is reached through its mouth alone, and stays.
+    is_own = (fields[:, -1] == 0)[faces].all(axis=1)
+    own, rest = faces[is_own], faces[~is_own]
+    side = np.full(len(fields), -1)
+    side[rest] = topology.face_components(rest)[:, None]
+    loops = triangles.boundary_loops(fields[:, :3], own)  # the foot first
+    for loop in loops[1:]:
+        if side[loop[0]] == side[loops[0][0]]:
+            ring, twin = len(fields) + np.arange(len(loop)), np.arange(len(fields))
+            twin[loop] = ring
+            fan = np.stack([np.roll(ring, -1), ring, np.full(len(ring), ring[-1] + 1)], axis=1)
+            own = np.concatenate([twin[own], fan])
+            fields = np.concatenate([fields, fields[loop], fields[loop].mean(axis=0)[None]])
+    return fields, np.concatenate([rest, own]).astype(np.int32)
 
 
 def _wall(fields: Floats, faces: Ints, thin_mm: float, bulge: Bulge) -> Wall:
