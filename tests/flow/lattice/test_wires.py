@@ -93,8 +93,12 @@ def test_blood_drags_wires_along(resolved: FlowCase, flow: State) -> None:
 
 
 def test_wires_too_thin_for_the_grid_are_walls_on_a_finer_level(resolved: FlowCase) -> None:
-    """Of a wire that is a wall no band resists any more."""
-    case = replace(resolved, numerics=replace(resolved.numerics, cell_size_mm=2 * CELL_MM))
+    """Of a wire that is a wall neither a band nor a region of coils resists any more."""
+    sheet = resolved.media[0]
+    in_sac_mm, still = sheet.points_mm + [0.4, 0.0, 0.0], np.zeros_like(sheet.normals)
+    coils = replace(sheet, points_mm=in_sac_mm, normals=still, spacing_mm=sheet.wire_diameter_mm)
+    numerics = replace(resolved.numerics, cell_size_mm=2 * CELL_MM)
+    case = replace(resolved, media=(*resolved.media, coils), numerics=numerics)
     assert domain.wires_of(case, 2 * CELL_MM) is None
     state = LatticeBoltzmann(2 * CELL_MM).init(case, None)
     coarse, fine = state.levels

@@ -230,7 +230,8 @@ def beside_walls(case: FlowCase, blood_mm: Floats) -> FlowCase:
         nearest_mm, away_mm, _ = wires.closest(sheet.points_mm)
         is_wall = tree.query(nearest_mm)[0] < thickness_mm(wires)
         is_own = away_mm < 0.5 * BREADTH * sheet.spacing_mm + thickness_mm(wires)
-        return sheet.part(~(is_wall & is_own & sheet.normals.any(axis=1)))
+        is_region = ~sheet.normals.any(axis=1)
+        return sheet.part(~(is_wall & (is_own | is_region)))
 
     return replace(case, media=tuple(left(one) for one in case.media))
 
