@@ -22,15 +22,8 @@ from vstent.flow.settings import Blood
 FREE_MM, WIDER_MM = 3.7, 4.3
 PROFILE = ((0.0, WIDER_MM), (0.08, FREE_MM), (0.92, FREE_MM), (1.0, WIDER_MM))
 DUAL = Braid("dual", "Dual", ((48, 30.0),), 1.15, (Size(4.0, 13.0, 4.2),), strands=(Strands(16, 60.0, "outside", 2.5),))
-LOOPED = Braid(
-    "looped",
-    "Looped",
-    ((16, 60.0),),
-    1.13,
-    (Size(4.5, 15.0, 4.7),),
-    (Strands(2, 80.0, "beside"),),
-    has_closed_ends=True,
-)
+BESIDE = (Strands(2, 80.0, "beside"),)
+LOOPED = Braid("looped", "Looped", ((16, 60.0),), 1.13, (Size(4.5, 15.0, 4.7),), BESIDE, has_closed_ends=True)
 FLARED = Braid("flared", "Flared", ((16, 60.0),), 1.0, (Size(3.5, 15.0, FREE_MM, 0.0, PROFILE),))
 OPEN = LaserCut(
     "open", "Open", 16, 60.0, 60.0, 0.61, (Size(4.5, 21.0, 4.5),), joined_crowns=("1000", "0010"), crown_gap_um=150.0

@@ -95,7 +95,7 @@ def test_blood_drags_wires_along(resolved: FlowCase, flow: State) -> None:
 def test_wires_too_thin_for_the_grid_are_walls_on_a_finer_level(resolved: FlowCase) -> None:
     """Of a wire that is a wall neither a band nor a region of coils resists any more."""
     sheet = resolved.media[0]
-    in_sac_mm, still = sheet.points_mm + [0.4, 0.0, 0.0], np.zeros_like(sheet.normals)
+    in_sac_mm, still = sheet.points_mm + np.array([0.4, 0.0, 0.0]), np.zeros_like(sheet.normals)
     coils = replace(sheet, points_mm=in_sac_mm, normals=still, spacing_mm=sheet.wire_diameter_mm)
     numerics = replace(resolved.numerics, cell_size_mm=2 * CELL_MM)
     case = replace(resolved, media=(*resolved.media, coils), numerics=numerics)
