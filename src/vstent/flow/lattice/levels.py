@@ -364,14 +364,7 @@ def _coupled(coarse: Grid, fine: Grid, layer_of_wide: Ints, layer_of_fine: Ints)
     size_mm = np.bincount(of_link, np.linalg.norm(ahead_mm, axis=1), groups)
     total_mm = np.stack([np.bincount(of_link, along_mm, groups) for along_mm in ahead_mm.T], axis=1)
     normal = total_mm / np.maximum(size_mm, 1e-300)[:, None]
-    # Through the only border of a refined part nothing flows in sum.
-    inside, outside, _ = links[0]
-    is_part = np.zeros(wide.index.shape, dtype=bool)
-    is_part[tuple(wide.cells[sides[0]].T)] = True
-    part = np.zeros(groups, dtype=int)
-    number, _ = ndimage.label(is_part, np.ones((3, 3, 3)))
-    part[group[np.searchsorted(beside, outside)]] = number[tuple(wide.cells[inside].T)]
-    normal[np.bincount(part)[part] == 1] = 0.0
+    normal[_is_alone(wide, sides[0], links[0][0], group[np.searchsorted(beside, links[0][1])], groups)] = 0.0
 
     def carried(read: Grid, written: Grid, target: Ints) -> Stencil:
         of_cell = group_at(written.domain.centers_mm[target])
@@ -399,6 +392,20 @@ def _coupled(coarse: Grid, fine: Grid, layer_of_wide: Ints, layer_of_fine: Ints)
         (inner := np.flatnonzero(sides[1] & (in_wide >= 0)), in_wide[inner]),
     )
     return grids[0], grids[1], coupling
+
+
+def _is_alone(wide: Domain, is_own: Bools, inside: Ints, of_link: Ints, groups: int) -> Bools:
+    """Return whether each group is the only border of its refined part, through which nothing flows in sum.
+
+    `is_own` (n,) are the cells of the grid in refined parts, `inside` (l,) those at links across borders, and `of_link`
+    (l,) the groups of these links.
+    """
+    refined_parts = np.zeros(wide.index.shape, dtype=bool)
+    refined_parts[tuple(wide.cells[is_own].T)] = True
+    number, _ = ndimage.label(refined_parts, np.ones((3, 3, 3)))
+    part = np.zeros(groups, dtype=int)
+    part[of_link] = number[tuple(wide.cells[inside].T)]
+    return np.asarray(np.bincount(part)[part] == 1)
 
 
 def _shares(group: Ints, size: Floats, groups: int) -> Floats:
