@@ -37,7 +37,9 @@ def anatomy() -> Anatomy:
 
 @pytest.fixture(scope="module")
 def preview(anatomy: Anatomy):
-    found = LiveFlowProcess(anatomy, FlowSettings(inflow_mL_s=1.5, numerics=Numerics(cells_per_diameter=13.0)))
+    found = LiveFlowProcess(
+        anatomy, FlowSettings(inflow_mL_s=1.5, numerics=Numerics(cells_per_diameter=13.0, cells_across_neck=0.0))
+    )
     yield found
     found.stop()
 
@@ -156,7 +158,7 @@ def in_time(holds) -> bool:
 
 
 def test_what_is_prepared_is_stored_and_continued(anatomy: Anatomy, tmp_path: Path) -> None:
-    settings = FlowSettings(inflow_mL_s=1.5, numerics=Numerics(cells_per_diameter=13.0))
+    settings = FlowSettings(inflow_mL_s=1.5, numerics=Numerics(cells_per_diameter=13.0, cells_across_neck=0.0))
     store, bare = BareFlowStore.of(tmp_path, "anatomy", settings), []
     stent = vstent.deploy(vstent.find_design("silk"), anatomy).stent
     for damage in (None, None, slice(0, 1000)):

@@ -236,7 +236,7 @@ class _Box:
         way = directions.VELOCITIES[direction]
         impulse = (d3q19.WEIGHTS[direction] * (way @ force))[:, None] * way
         solids = [self._solid == solid for solid in range(self._solid.max() + 1)]
-        read = np.stack([exchanged(self._f, address[own], direction[own]) for own in solids])
+        read = np.stack([exchanged(self._f, address[own], direction[own]).sum(axis=0) for own in solids])
         met = np.stack([impulse[own].sum(axis=0) for own in solids])
         lacking = force * self.is_blood.sum() - read.sum(axis=0)
         return read + met * (lacking @ force) / (met.sum(axis=0) @ force)

@@ -26,7 +26,9 @@ from vstent.study.ranking_flows import FlowStore
 from vstent.study.store import Key
 
 ARTERY = Key("anatomy", "code")
-SETTINGS = FlowSettings(inflow_mL_s=1.5, numerics=Numerics(cells_per_diameter=11.0, tolerance=0.02))
+SETTINGS = FlowSettings(
+    inflow_mL_s=1.5, numerics=Numerics(cells_per_diameter=11.0, cells_across_neck=0.0, tolerance=0.02)
+)
 
 
 @cache

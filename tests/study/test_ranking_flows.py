@@ -21,7 +21,9 @@ from vstent.study.ranking_flows import FlowStore, FlowTask, compute_missing, par
 from vstent.study.store import Key
 from vstent.study.workers import Processes
 
-SETTINGS = FlowSettings(inflow_mL_s=1.5, numerics=Numerics(cells_per_diameter=8.0, tolerance=0.05))
+SETTINGS = FlowSettings(
+    inflow_mL_s=1.5, numerics=Numerics(cells_per_diameter=8.0, cells_across_neck=0.0, tolerance=0.05)
+)
 
 
 @cache
@@ -81,7 +83,7 @@ def test_as_many_flows_as_fit_in_memory_run_beside_each_other(monkeypatch):
     for free, jobs, wanted in ((3.5, 8, 3), (3.5, 2, 2), (0.5, 8, 1)):
         monkeypatch.setattr(ranking_flows, "free_memory_bytes", lambda free=free: free * needed_MB * 1e6)
         assert parallel_flows(anatomy(), chosen, SETTINGS, jobs)[0] == wanted
-    on_gpu = FlowSettings(numerics=Numerics(cells_per_diameter=8.0, device_gpu=True))
+    on_gpu = FlowSettings(numerics=Numerics(cells_per_diameter=8.0, cells_across_neck=0.0, device_gpu=True))
     assert parallel_flows(anatomy(), chosen, on_gpu, 8)[0] == 1
 
 

@@ -87,10 +87,14 @@ def over_restored(stent: Stent, anatomy: Anatomy) -> Stent:
     """
     if isinstance(stent, Coils):
         return stent
-    is_over = is_over_restored(stent, anatomy, stent.wire_points_mm)
+    return part_of(stent, is_over_restored(stent, anatomy, stent.wire_points_mm))
+
+
+def part_of(stent: Stent, chosen: Bools) -> Stent:
+    """Return a stent with only the pieces of its wires between chosen points (n,)."""
     wire = stent.point_wires
-    first = is_over & ~np.r_[False, is_over[:-1] & (wire[1:] == wire[:-1])]
-    piece, kept = np.cumsum(first) - 1, np.flatnonzero(is_over)
+    first = chosen & ~np.r_[False, chosen[:-1] & (wire[1:] == wire[:-1])]
+    piece, kept = np.cumsum(first) - 1, np.flatnonzero(chosen)
     kept = kept[np.bincount(piece[kept])[piece[kept]] > 1]  # a single point is no piece
     is_first = np.diff(piece[kept], prepend=-1) > 0
     return replace(

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 Outlets = Literal["zero_pressure", "murray", "split", "resistance", "windkessel"]
 """Condition at the outlets."""
-Wires = Literal["auto", "screen", "resolved"]
+Wires = Literal["auto", "screen", "calibrated", "resolved"]
 """How a flow takes the wires over necks and branches."""
 RESISTING: Final = ("resistance", "windkessel")
 """Conditions with which the flow out follows the pressure."""
@@ -134,16 +134,20 @@ class Numerics:
     wires: Wires = setting(
         "screen",
         "wires",
-        "wires over necks and branches: a flow resistance (screen), walls on finer grids around them (resolved), or "
-        "walls where that takes less than ten minutes (auto)",
+        "wires over necks and branches: a flow resistance (screen), one read off wires that are walls in a piece of "
+        "the neck (calibrated), walls on finer grids around them (resolved), or the best that takes less than ten "
+        "minutes (auto)",
         str,
         choices=get_args(Wires),
         metavar="WORD",
     )
     """How the embedded engine takes the wires over necks and ostia: as media, or as walls on as many finer levels as
-    they need for two to four cells across. Coarser levels have the media where wires are too thin for them."""
+    they need for two to four cells across. Coarser levels have the media where wires are too thin for them. Calibrated
+    media resist as the wires do (see `lattice.calibration`)."""
     cells_per_diameter: float = 29.0
     """Number of cells across the mean (hydraulic) diameter 4 V / A of the vessel, where no grid spacing is given."""
+    cells_across_neck: float = 32.0
+    """Least number of cells across a neck with a screen, on a finer level around it where no grid spacing is given."""
     cell_budget: float = 480_000.0
     """Maximum number of cells in the vessel, where no grid spacing is given."""
     tolerance: float = 0.01
@@ -152,7 +156,7 @@ class Numerics:
     when the standard error of every time average is smaller than this fraction."""
     max_steps: int = 96_000
     """Maximum number of time steps of a steady flow on the finest grid kept. With `close_up` at most a third of them,
-    with finer levels around wires an eighth."""
+    with wires as walls of finer levels an eighth."""
     max_cycles: int = 4
     """Maximum number of cycles of a pulsatile flow."""
     cycle_tolerance: float = 0.02

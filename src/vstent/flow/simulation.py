@@ -33,7 +33,9 @@ COARSE_SHARE = 0.12
 """Assumed share of the run time of each coarse run, for the progress."""
 
 QUICK_S = 600.0
-"""Foretold run time up to which wires are resolved where that is left to the program."""
+"""Expected run time up to which wires are resolved or calibrated where that is left to the program."""
+USUAL_PART = 1 / 3
+"""Usual part of the most that a flow may take: flows with walls took 0.2 to 0.3 of it."""
 
 CALMER_TRIES = 3
 """Maximum number of retries of a diverged run, each with a shorter time step."""
@@ -132,16 +134,24 @@ def _with_wires(case: FlowCase, wires: Wires) -> FlowCase:
 
 def _decided(case: FlowCase) -> tuple[FlowCase, str]:
     """Return a case with its wires as walls or as a screen where that is open, and a sentence with the reason."""
+    from vstent.flow.lattice import calibration
     from vstent.flow.lattice.cost import estimate
 
     are_coils = any(isinstance(one, Coils) for one in case.solids)  # their indices are those of a porous region
     if case.numerics.wires != "auto" or case.numerics.engine != LATTICE or case.wires is None or are_coils:
         return (_with_wires(case, "screen") if case.numerics.wires == "auto" else case), ""
-    cost = estimate(_with_wires(case, "resolved"))
-    how = f"resolving them would take {duration(cost.seconds)} and {cost.memory_bytes / 1e9:.2g} GB."
-    if case.numerics.device_gpu or cost.seconds > QUICK_S or cost.memory_bytes > free_memory_bytes():
-        return _with_wires(case, "screen"), f" The wires are a screen: {how}"
-    return _with_wires(case, "resolved"), ""
+    cost, screen = estimate(_with_wires(case, "resolved")), _with_wires(case, "screen")
+    how = f"resolving them would take about {duration(USUAL_PART * cost.seconds)} and {cost.memory_bytes / 1e9:.2g} GB."
+    if case.numerics.device_gpu:
+        return screen, f" The wires are a screen: {how}"
+    if USUAL_PART * cost.seconds < QUICK_S and cost.memory_bytes < free_memory_bytes():
+        return _with_wires(case, "resolved"), ""
+    if calibration.suits(case):
+        seconds = calibration.seconds(case) + calibration.ROUNDS * USUAL_PART * estimate(screen).seconds
+        if seconds < QUICK_S:
+            return _with_wires(case, "calibrated"), f" The wires are a calibrated screen: {how}"
+        how += f" Calibrating them would take about {duration(seconds)}."
+    return screen, f" The wires are a screen: {how}"
 
 
 def _resisted(case: FlowCase, bare: FlowField | None) -> FlowCase:
@@ -187,10 +197,10 @@ def engine_class(numerics: Numerics, *, is_pulsatile: bool) -> type[AbstractEngi
             f"the engine {numerics.engine} does not support a finer grid in the sac alone: switch it off "
             f"(--refine-sac), or choose the engine {LATTICE}"
         )
-    if (numerics.close_up or numerics.wires == "resolved") and numerics.device_gpu:
+    if (numerics.close_up or numerics.wires in ("calibrated", "resolved")) and numerics.device_gpu:
         raise InputError(
-            "finer grids in the sac and around wires are not computed on a GPU: leave out --refine-sac and --wires "
-            "resolved, or compute on the CPU (without --gpu)"
+            "finer grids in the sac and around wires are not computed on a GPU: leave out --refine-sac and --wires, or "
+            "compute on the CPU (without --gpu)"
         )
     if numerics.device_gpu and not engine.runs_on_gpu:
         raise InputError(
@@ -238,6 +248,8 @@ class _Runs:
     checkpoint: Checkpoint | None
     similar: FlowField | None = None
     """Flow with a similar stent, from which the whole vessel starts."""
+    prefix: str = ""
+    """Begin of the names of runs, which tells those before a calibration from the last one."""
 
     def answer(self, case: FlowCase, start: FlowField | None) -> FlowField:
         """Compute a flow from a first guess on coarser grids, each of which starts from the next coarser one.
@@ -245,12 +257,15 @@ class _Runs:
         Every run is begun only where a finer one needs its result; a finer one that is resumed does not. If the flow
         without a device is known, a coarse grid only provides the change due to the screen (see `_guess`).
         """
+        if case.numerics.wires == "calibrated" and self.engine.has_levels:
+            return self._calibrated(case, start)
         if case.numerics.wires == "resolved" and case.wires is not None and self.engine.has_levels:
-            as_screen = replace(self, progress=None if self.progress is None else self._part(0.0, SCREEN_SHARE))
+            as_screen = replace(self, progress=self._part(0.0, SCREEN_SHARE))
             begun = partial(as_screen.answer, _with_wires(case, "screen"), start)
             return self._run("resolved", case, default_cell_size_mm(case), begun, (SCREEN_SHARE, 1.0))
         sizes_mm, coarsening = [default_cell_size_mm(case)], self.engine.coarsening
-        whole = replace(case, numerics=replace(case.numerics, close_up=False))  # a guess has one level
+        one_level = replace(case.numerics, close_up=False, cells_across_neck=0.0)
+        whole = replace(case, numerics=one_level)  # a guess
         if coarsening is not None and self.similar is None and (start is None or case.media):
             volume_mm3 = abs(case.vessel.closed.volume_mm3)
             while volume_mm3 >= 4 * MIN_CELLS * (coarsening * sizes_mm[-1]) ** 3:
@@ -268,6 +283,27 @@ class _Runs:
             guess = cache(partial(_guess, bare[depth - 1], bare[depth], run_))
         return self._run("answer", case, sizes_mm[0], guess, (runs * share, 1.0))
 
+    def _calibrated(self, case: FlowCase, start: FlowField | None) -> FlowField:
+        """Compute the flow with a screen that is calibrated in steady flows; one that cannot be stays, and it is told."""
+        from vstent.flow.lattice import calibration
+
+        case, runs = _with_wires(case, "screen"), calibration.ROUNDS + 1
+        if not calibration.suits(case):
+            field = self.answer(case, start)
+            return replace(field, advice=f"{field.advice} The screen is not calibrated, because pores are too wide.")
+        similar, factor, size_mm = self.similar, 1.0, default_cell_size_mm(case)
+        rounds: list[tuple[float, float, float]] = []
+        for number in range(runs - 1):
+            steady = replace(calibration.scaled(case, factor), waveform=None)
+            progress = self._part(number / runs, (number + 1) / runs)
+            now = replace(self, prefix=f"round {number} ", progress=progress, similar=similar)
+            similar = now.answer(steady, start)
+            rounds.append((factor, *calibration.read_off(steady, similar, size_mm)))
+            factor = calibration.next_factor(rounds)
+        last = replace(self, progress=self._part(1 - 1 / runs, 1.0), similar=similar)
+        field = last.answer(calibration.scaled(case, factor), start)
+        return replace(field, advice=f"{field.advice} The screen is calibrated: it resists {factor:.3g} times as much.")
+
     def _bare(self, name: str, case: FlowCase, size_mm: float, finer: Guess, part: Part) -> FlowField | None:
         """Return the flow without a device on a coarse grid, from a finer one and computed only once; None without."""
         start = finer()
@@ -281,6 +317,7 @@ class _Runs:
 
     def _run(self, name: str, case: FlowCase, size_mm: float, guess: Guess, part: Part) -> FlowField:
         """Run an engine from a guess or a saved state; after divergence start again with the engine's calmer case."""
+        name = self.prefix + name
         engine = self.engine(size_mm, self.folder if name == "answer" else self.folder / name)
         guess, checkpoint = cache(partial(_guessed, engine, case, guess)), self.checkpoint
         saved = None if checkpoint is None else checkpoint.load(name)

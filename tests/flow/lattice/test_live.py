@@ -35,7 +35,7 @@ from vstent.flow.simulation import simulate_case
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.archive import load_data, save_data
 
-SETTINGS = FlowSettings(inflow_mL_s=1.5, numerics=Numerics(cells_per_diameter=13.0))
+SETTINGS = FlowSettings(inflow_mL_s=1.5, numerics=Numerics(cells_per_diameter=13.0, cells_across_neck=0.0))
 """A default grid coarser than a preview's: the preview takes it."""
 
 

@@ -76,15 +76,15 @@ def test_walls_wires_and_ends_together_take_up_no_momentum_in_steady_flow(flow: 
     address, stride = flow.links.address, flow.addressing.stride
     of_walls = slice(flow.links.start[-1], None)
     direction = address[:, 2] // stride
-    on_walls = exchanged(flow.populations, address[of_walls], direction[of_walls])
-    whole = exchanged(flow.populations, address, direction)
+    on_walls = exchanged(flow.populations, address[of_walls], direction[of_walls]).sum(axis=0)
+    whole = exchanged(flow.populations, address, direction).sum(axis=0)
     np.testing.assert_allclose(whole, 0.0, atol=0.015 * np.linalg.norm(on_walls))
 
 
 def test_blood_drags_wires_along(resolved: FlowCase, flow: State) -> None:
     assert resolved.wires is not None
     force, direction = force_N(flow), flow.links.wire_direction
-    momentum = exchanged(flow.populations, flow.links.address[flow.links.of_wires], direction)
+    momentum = exchanged(flow.populations, flow.links.address[flow.links.of_wires], direction).sum(axis=0)
     scales = flow.scales
     speed = scales.cell_m / scales.step_s
     np.testing.assert_allclose(force, momentum * 1060.0 * scales.cell_m**2 * speed**2)

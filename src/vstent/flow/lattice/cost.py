@@ -78,11 +78,15 @@ def estimate(case: FlowCase) -> Cost:
     cell_size_mm = default_cell_size_mm(case)
     cells, memory_bytes = _size(case, cell_size_mm)
     steps = _steps(case, cell_size_mm)
-    of_levels = _cells(case, cell_size_mm)[::-1]
-    updates = sum(of_level * steps / WIDTH**depth for depth, of_level in enumerate(of_levels))
-    over_block = WHOLE_OVER_BLOCK if len(of_levels) <= 1 + case.numerics.close_up else AROUND_WIRES_OVER_BLOCK
-    seconds = updates / block_rate(on_gpu=case.numerics.device_gpu) * over_block
-    return Cost(cell_size_mm, round(cells), round(memory_bytes), steps, seconds)
+    return Cost(cell_size_mm, round(cells), round(memory_bytes), steps, seconds_of(case, cell_size_mm, steps))
+
+
+def seconds_of(case: FlowCase, cell_size_mm: float, steps: float) -> float:
+    """Estimate the run time of so many time steps on the finest level."""
+    of_levels, kept = _cells(case, cell_size_mm), 1 + case.numerics.close_up
+    per_step = np.array(of_levels) * WIDTH ** np.arange(1.0 - len(of_levels), 1.0)
+    in_block = WHOLE_OVER_BLOCK * per_step[:kept].sum() + AROUND_WIRES_OVER_BLOCK * per_step[kept:].sum()
+    return float(in_block) * steps / block_rate(on_gpu=case.numerics.device_gpu)
 
 
 def _cells(case: FlowCase, cell_size_mm: float) -> list[float]:
@@ -152,16 +156,17 @@ def _steps(case: FlowCase, cell_size_mm: float) -> int:
     """Return the maximum number of time steps on the finest level."""
     sizes, kept = sizes_mm(case, cell_size_mm), 1 + case.numerics.close_up
     if case.waveform is None:
-        return int(part_of_steps(len(sizes), kept) * case.numerics.max_steps) * WIDTH ** (len(sizes) - kept)
+        return int(part_of_steps(case, len(sizes)) * case.numerics.max_steps) * WIDTH ** (len(sizes) - kept)
     return WIDTH ** (len(sizes) - 1) * int(pace(case, sizes[0], None).sum()) * case.numerics.max_cycles
 
 
-def part_of_steps(levels: int, kept: int) -> float:
-    """Return the part of the allowed time steps of a steady flow that a run with levels makes, of which some are kept.
+def part_of_steps(case: FlowCase, levels: int) -> float:
+    """Return the part of the allowed time steps of a steady flow that a run with so many levels makes.
 
     It is small where it begins from a flow on the coarsest level, or from the flow with a screen.
     """
-    return 1.0 if levels == 1 else 1 / 3 if levels == kept else 1 / 8
+    are_walls = case.numerics.wires == "resolved" and levels > 1 + case.numerics.close_up
+    return 1 / 8 if are_walls else 1 / 3 if case.numerics.close_up else 1.0
 
 
 @cache

@@ -126,7 +126,7 @@ class LatticeBoltzmann(AbstractLattice):
 
     def max_checks(self, state: State) -> int:
         """Return the maximum number of checks within the limit of time steps."""
-        steps = part_of_steps(len(state.levels), len(state.kept)) * state.case.numerics.max_steps
+        steps = part_of_steps(state.case, len(state.levels)) * state.case.numerics.max_steps
         return max(4, int(steps // state.main.steps_per_check))
 
     def result(self, state: State, outcome: Outcome) -> FlowField:

@@ -27,7 +27,7 @@ nothing flows through it in sum, and no momentum is added: beside a neck it woul
 """
 
 from dataclasses import dataclass, replace
-from math import ceil, log2, pi, sqrt
+from math import ceil, inf, log2, pi, sqrt
 from typing import Final
 
 import numpy as np
@@ -43,6 +43,7 @@ from vstent.flow import domain as domains
 from vstent.flow.case import FlowCase, Sheet
 from vstent.flow.domain import Domain, Window
 from vstent.flow.drag import BREADTH
+from vstent.flow.indices import neck_diameter_mm
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.setup import Crossings, Grid, address, behind, thickest
 from vstent.geometry.surface import Surface
@@ -75,6 +76,8 @@ BESIDE_NECK: Final = 6.0
 MARGIN_CELLS: Final = 14.0
 """Distance in cells by which a refined part around wires exceeds the next finer one: with less, the distance kept from
 the border and `RIM` leave no room for that along diagonals."""
+SCREEN_CELLS: Final = 2.0
+"""Further distance in cells around a screen, which is spread over layers of cells."""
 CHANGING: Final = ("crossed", "lack", "push")
 """Arrays of an `Interface` that change during a run."""
 CHUNK: Final = 10_000
@@ -206,7 +209,8 @@ def near_narrow(case: FlowCase, grid: Domain) -> Bools:
 def _reach_mm(case: FlowCase, size_mm: float, finest_mm: float) -> float:
     """Return the distance from wires to which a grid with this spacing is refined: their thickness at the finest."""
     assert case.wires is not None
-    return thickness_mm(case.wires) + MARGIN_CELLS * max(0.0, size_mm - WIDTH * finest_mm)
+    own_mm = 0.0 if case.numerics.wires == "resolved" else SCREEN_CELLS * size_mm
+    return own_mm + thickness_mm(case.wires) + MARGIN_CELLS * max(0.0, size_mm - WIDTH * finest_mm)
 
 
 def _walls(case: FlowCase) -> Surface:
@@ -305,10 +309,23 @@ def sizes_mm(case: FlowCase, cell_size_mm: float) -> tuple[float, ...]:
     With `close_up` one is coarser; those around wires are finer. Where there is no sac a `FlowError` is raised.
     """
     coarser = int(case.numerics.close_up and require_sac(case) is not None)
-    finer = 0
-    if case.numerics.wires == "resolved" and case.wires is not None:
-        finer = max(0, ceil(log2(domains.LEAST_ACROSS * cell_size_mm / thickness_mm(case.wires))))
+    finer = ceil(log2(max(1.0, cell_size_mm / around_wires_mm(case))))
     return tuple(cell_size_mm / WIDTH**k for k in range(-coarser, finer + 1))
+
+
+def around_wires_mm(case: FlowCase) -> float:
+    """Return the largest grid spacing that suits the wires of a case; inf without wires, or where it was chosen.
+
+    Walls need cells across a wire, and a screen `cells_across_neck`.
+    """
+    numerics = case.numerics
+    if case.wires is None:
+        return inf
+    if numerics.wires == "resolved":
+        return thickness_mm(case.wires) / domains.LEAST_ACROSS
+    if case.ostium is None or numerics.cell_size_mm is not None or numerics.device_gpu:
+        return inf
+    return neck_diameter_mm(case.ostium) / max(numerics.cells_across_neck, 1e-9)
 
 
 def refined(case: FlowCase, coarse: Grid, finest_mm: float) -> tuple[Grid, Grid, Interface]:
@@ -321,7 +338,7 @@ def refined(case: FlowCase, coarse: Grid, finest_mm: float) -> tuple[Grid, Grid,
     wanted = np.zeros(len(wide.cells), bool)
     if case.numerics.close_up and not coarse.crossings:
         wanted = near_sac(case, wide) | near_narrow(case, wide)
-    if case.numerics.wires == "resolved" and case.wires is not None and wide.cell_size_mm > 1.5 * finest_mm:
+    if wide.cell_size_mm > max(1.5 * finest_mm, around_wires_mm(case)):
         wanted |= near_wires(case, wide, finest_mm)
     part, layer = window(wide, wanted, None if coarse.side is None else coarse.side % 2 == 0)
     size_mm = wide.cell_size_mm / WIDTH

@@ -211,7 +211,7 @@ class LiveFlow:
         self, case: FlowCase, told: Callable[[float], None] | None = None, stored: BareFlow | None = None
     ) -> None:
         numerics = replace(case.numerics, close_up=True, wires="screen", device_gpu=False, tolerance=TOLERANCE)
-        self.case = replace(case, waveform=None, numerics=numerics)
+        self.case = replace(case, waveform=None, numerics=replace(numerics, cells_across_neck=0.0))
         self.cell_size_mm = preview_spacing_mm(self.case)
         self.outer = self._around(told) if stored is None else stored.outer
         engine = LatticeBoltzmann(self.cell_size_mm)

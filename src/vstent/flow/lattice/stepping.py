@@ -461,7 +461,7 @@ def snapshots(state: State) -> list[Snapshot]:
 
 def snapshot(state: State) -> Snapshot:
     """Return the present flow; in a screen the velocity includes half of its force."""
-    density, velocity, outflow = _read_here(state) if state.device is None else state.device.read()
+    density, velocity, outflow = read_here(state) if state.device is None else state.device.read()
     cells, a = state.screen.cell, state.addressing
     if len(cells):
         time, law = np.float32(state.scales.relaxation_steps), state.scales.thinning
@@ -475,7 +475,7 @@ def snapshot(state: State) -> Snapshot:
     return Snapshot(state.scales, velocity, density, outflow)
 
 
-def _read_here(state: State) -> tuple[NDArray[np.float32], NDArray[np.float32], Floats]:
+def read_here(state: State) -> tuple[NDArray[np.float32], NDArray[np.float32], Floats]:
     """Return density deviation (n,) and momentum (n, 3) of every cell, and the flow rate (k,) out of every end."""
     f, links = state.populations, state.links
     moment = d3q19.moments(f, state.addressing.stride, state.addressing.place).astype(np.float32)
