@@ -284,7 +284,7 @@ class _Runs:
         return self._run("answer", case, sizes_mm[0], guess, (runs * share, 1.0))
 
     def _calibrated(self, case: FlowCase, start: FlowField | None) -> FlowField:
-        """Compute the flow with a screen that is calibrated in steady flows; one that cannot be stays, and it is told."""
+        """Compute the flow with a screen that is calibrated in steady flows; what cannot be calibrated stays."""
         from vstent.flow.lattice import calibration
 
         case, runs = _with_wires(case, "screen"), calibration.ROUNDS + 1

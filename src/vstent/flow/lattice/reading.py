@@ -193,7 +193,7 @@ def force_N(state: State) -> Floats:
 
 
 def forces_N(state: State) -> tuple[Floats, Floats]:
-    """Return cells (m, 3), mm, of a level, and the force (m, 3) of their blood on wires beside them or on the screen."""
+    """Return cells (m, 3), mm, of a level, and the force (m, 3) of their blood on wires beside them and on a screen."""
     links, a, screen = state.links, state.addressing, state.screen
     address = links.address[links.of_wires]
     on_walls = exchanged(state.populations, address, links.wire_direction)
