@@ -1,18 +1,16 @@
 """Film the stored contrast of several flows along one C-arm direction."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from scipy.sparse import csc_array
 
-from vstent.angiography.film import ENERGY_KEV, Film, check_frame_rate, film_of, iodine_cm2_g
+from vstent.angiography.film import ENERGY_KEV, check_frame_rate, iodine_cm2_g
 from vstent.angiography.history import History
 from vstent.angiography.projection import Projector, projector_of
 from vstent.angiography.view import PIXEL_MM, SOURCE_DETECTOR_MM, SOURCE_ISOCENTER_MM, View, fitted
-from vstent.angiography.working_projection import working_projection
-from vstent.geometry.vessel import Anatomy
 
 SOME: Final = 20_000
 """Number of cells that determine the size of the detector."""
@@ -50,11 +48,6 @@ class FilmSettings:
         return self.pixel_mm, self.source_detector_mm, self.source_isocenter_mm
 
 
-def aimed(settings: FilmSettings, anatomy: Anatomy) -> FilmSettings:
-    """Return settings with a direction: the one given, or the working projection."""
-    return settings if settings.angles_rad else replace(settings, angles_rad=working_projection(anatomy))
-
-
 def view_for(histories: Mapping[str, History], settings: FilmSettings) -> View:
     """Return the view of films, with a detector that shows all cells; without a direction it is frontal."""
     points = np.concatenate([one.points_mm[:: max(1, len(one.points_mm) // SOME)] for one in histories.values()])
@@ -77,11 +70,3 @@ def projectors_of(view: View, histories: Mapping[str, History]) -> dict[str, Pro
             shared = csc_array((np.ones(m, np.float32), (np.arange(m), history.block)), shape=(m, n))
             projectors[name] = Projector(view, cells.matrix @ shared)
     return projectors
-
-
-def films_of(
-    histories: Mapping[str, History], projectors: Mapping[str, Projector], settings: FilmSettings
-) -> dict[str, Film]:
-    """Return the film of every flow by name."""
-    how: dict[str, Any] = {"frame_rate_Hz": settings.frame_rate_Hz, "energy_keV": settings.energy_keV}
-    return {name: film_of(history.frames(), projectors[name], **how) for name, history in histories.items()}

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from vstent.angiography.angiogram import Angiogram, AngiogramSettings
-from vstent.angiography.filming import FilmSettings, aimed
+from vstent.angiography.filming import FilmSettings
+from vstent.angiography.working_projection import working_projection
 from vstent.devices.catalogue import find_design
 from vstent.devices.treatment import BARE
 from vstent.reporting.films import Density, shown_of, write_films
@@ -43,7 +44,8 @@ def film_case(
     titles = {BARE: "Before"} | {
         one.name: " + ".join(find_design(key).name for key in one.devices) for one in treatments
     }
-    shown = shown_of(histories, stents, titles, aimed(film, anatomy))
+    aimed = film if film.angles_rad else replace(film, angles_rad=working_projection(anatomy))
+    shown = shown_of(histories, stents, titles, aimed)
     curves = {titles[name]: one.curves for name, one in found.items()}
     densities = [Density(title, one.time_s, one.sac_mg_mL, one.parent_mg_mL) for title, one in curves.items()]
     with claimed(out):

@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vstent.angiography.film import Film, levels_of, window_of, wire_shadow
-from vstent.angiography.filming import FilmSettings, films_of, projectors_of, view_for
+from vstent.angiography.film import Film, film_of, levels_of, window_of, wire_shadow
+from vstent.angiography.filming import FilmSettings, projectors_of, view_for
 from vstent.angiography.history import History
 from vstent.devices.stent import Stent
 from vstent.io.files import atomic
@@ -19,7 +19,7 @@ from vstent.io.writers import write_json
 from vstent.io.xa_writer import BITS, XaHeader, write_xa
 from vstent.kernels.arrays import Floats
 from vstent.reporting.figures import Picture, image_of
-from vstent.reporting.lettering import blank, font, put_title
+from vstent.reporting.lettering import blank, bytes_of, font, put_title
 from vstent.study.contrast import FOLDER
 
 ANIMATION: Final = "angiogram.webp"
@@ -75,17 +75,14 @@ def shown_of(
     view = view_for(histories, settings)
     projectors = projectors_of(view, histories)
     found = {}
-    for name, film in films_of(histories, projectors, settings).items():
+    rates = {"frame_rate_Hz": settings.frame_rate_Hz, "energy_keV": settings.energy_keV}
+    for name, history in histories.items():
+        film = film_of(history.frames(), projectors[name], **rates)
         shadows = [wire_shadow(view, stent) for stent in stents.get(name, ()) if settings.has_wires]
         wires = np.sum(np.stack(shadows), axis=0) if shadows else None
-        vessel = projectors[name](np.ones(histories[name].stored.shape[1])) if settings.has_vessel else None
+        vessel = projectors[name](np.ones(history.stored.shape[1])) if settings.has_vessel else None
         found[name] = Shown(titles[name], film, wires, vessel)
     return found
-
-
-def bytes_of(levels: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return grey levels from 0 to 1 as bytes."""
-    return np.rint(255 * levels).astype(np.uint8)
 
 
 def beside(shown: Sequence[Shown], window: float) -> list[NDArray[np.uint8]]:

@@ -3,9 +3,10 @@
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vstent.kernels.arrays import Floats
 
@@ -68,7 +69,7 @@ def color_bar(picture: "Picture", colors: Floats, span: tuple[float, float], wor
 
     left, right = round(0.30 * picture.width), round(0.70 * picture.width)
     top, bottom = picture.height - round(0.46 * DPI), picture.height - round(0.34 * DPI)
-    row = Image.fromarray(_bytes(colors[None]))
+    row = Image.fromarray(bytes_of(colors[None]))
     picture.paste(row.resize((right - left, bottom - top), Image.Resampling.NEAREST), (left, top))
     _write(picture, words, (0.5 * (left + right), top - points_px(3)), 7.5, INK, "ms")
     low, high = span
@@ -107,9 +108,9 @@ def put(picture: "Picture", image: Floats, corner: tuple[int, int]) -> None:
     """Put an image (height, width, 3), 0 to 1, into a picture."""
     from PIL import Image
 
-    picture.paste(Image.fromarray(_bytes(image)), corner)
+    picture.paste(Image.fromarray(bytes_of(image)), corner)
 
 
-def _bytes(image: Floats) -> np.ndarray:
+def bytes_of(image: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
     """Return an image, 0 to 1, as numbers from 0 to 255."""
     return np.rint(255 * image).astype(np.uint8)
