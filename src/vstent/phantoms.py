@@ -43,8 +43,7 @@ class Sac:
     """Semi-axis along `direction`."""
 
     def __post_init__(self) -> None:
-        freeze(self, "center_mm", np.float64, (3,))
-        freeze(self, "direction", np.float64, (3,))
+        freeze(self, "center_mm direction", np.float64, (3,))
 
     @property
     def reach_mm(self) -> float:

@@ -8,7 +8,6 @@ from vstent.app.choices import NECK_HANDLES
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Floats
-from vstent.reporting.scene import NECK_COLOUR, LineLayer, closed_layer
 
 POINTS: Final = 96
 """Number of points of a neck on the page."""
@@ -35,11 +34,6 @@ def pulled(anatomy: Anatomy, curve_mm: Floats, handle: int, to_mm: Floats) -> Fl
     weight = 0.5 * (1.0 + np.cos(np.pi * share))[:, None]
     moved = curve_mm + weight * (to_mm - curve_mm[at])
     return moved + weight * (anatomy.vessel.lumen.closest(moved)[0] - moved)
-
-
-def layer_of(curve_mm: Floats) -> LineLayer:
-    """Return a neck (n, 3) as a layer that replaces the one in the scene."""
-    return closed_layer("neck", [curve_mm], 0.08, NECK_COLOUR)
 
 
 def told(curve_mm: Floats) -> dict[str, Any]:

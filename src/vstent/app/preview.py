@@ -52,9 +52,11 @@ from vstent.kernels.arrays import Floats
 from vstent.plan.bands import gap_bands
 from vstent.reporting.packing import message
 from vstent.reporting.scene import (
+    NECK_COLOUR,
     LineLayer,
     MeshLayer,
     anatomy_layers,
+    closed_layer,
     contour_layer,
     flow_layers,
     implant_titles,
@@ -423,7 +425,7 @@ class Preview:
             curve = np.array(curve_mm, dtype=np.float64)
             if handle is not None and to_mm is not None:
                 curve = necks.pulled(self.anatomy, curve, handle, np.array(to_mm, dtype=np.float64))
-            return message([necks.layer_of(curve)], neck=necks.told(curve))
+            return message([closed_layer("neck", [curve], 0.08, NECK_COLOUR)], neck=necks.told(curve))
 
     def anatomy_sheet(self) -> list[dict[str, Any]]:
         """Return the metrics of the anatomy."""

@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-import secrets
 import threading
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -126,11 +125,6 @@ def create(work: Workspace, *, token: str, hosts: tuple[str, ...]) -> Guard:
         add(api, work, Depends(of_case))
     app.include_router(api)
     return Guard(app, token=token, hosts=hosts)
-
-
-def new_token() -> str:
-    """Return a random token."""
-    return secrets.token_urlsafe(24)
 
 
 def _refused(_: Request, error: Exception) -> JSONResponse:

@@ -2,6 +2,7 @@
 
 import argparse
 import importlib.util
+import secrets
 import socket
 import webbrowser
 from pathlib import Path
@@ -43,7 +44,7 @@ def _app(arguments: argparse.Namespace) -> int:
     import uvicorn
 
     from vstent.app.cases import Cases
-    from vstent.app.server import create, new_token
+    from vstent.app.server import create
     from vstent.app.workspace import Workspace
 
     workspace = Workspace(Cases(arguments.cases.resolve()))
@@ -54,7 +55,7 @@ def _app(arguments: argparse.Namespace) -> int:
     listener.bind((arguments.host, arguments.port))
     listener.listen(128)  # it listens already, so that the printed address answers at once
     port = listener.getsockname()[1]
-    token = new_token()
+    token = secrets.token_urlsafe(24)
     hosts = tuple(dict.fromkeys(f"{name}:{port}" for name in (arguments.host, "127.0.0.1", "localhost")))
     guard = create(workspace, token=token, hosts=hosts)
     url = f"http://{arguments.host}:{port}/?token={token}"

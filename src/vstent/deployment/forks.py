@@ -211,7 +211,8 @@ def _limit_mm(
     """
     limit_mm = np.full(rays.shape[:2], np.inf)
     if others:
-        faces = joined([_face(nodes_mm) for stent in others for nodes_mm in _faces_mm(stent)])
+        rows_mm = [face_mm for stent in others for face_mm in _faces_mm(stent)]
+        faces = joined([Surface(one.reshape(-1, 3), tube_faces(*one.shape[:2])) for one in rows_mm])
         limit_mm = faces.first_hit(origins_mm, rays.reshape(-1, 3)).reshape(rays.shape[:2]) - SPARE_MM
     for (stent, cell), here_mm in waists:
         from_mm, waist_mm = np.abs(abscissa_mm - here_mm)[:, None], cell.radius_mm - SPARE_MM
@@ -269,11 +270,6 @@ def _faces_mm(stent: Stent) -> tuple[Floats, Floats]:
     """Return the inner and the outer face (rows, columns, 3) of a stent."""
     outer_mm = stent.nodes_mm + stent.design.wall_offset_um * MM_PER_UM * normals(stent.nodes_mm)
     return inner_nodes_mm(stent), outer_mm
-
-
-def _face(nodes_mm: Floats) -> Surface:
-    """Return a face of a stent (rows, columns, 3) as a surface."""
-    return Surface(nodes_mm.reshape(-1, 3), tube_faces(*nodes_mm.shape[:2]))
 
 
 def _aside(axis_mm: Floats, path: Path, other: Path) -> Floats:

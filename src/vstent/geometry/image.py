@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vstent.errors import InputError
-from vstent.kernels.arrays import Floats, Ints, freeze
+from vstent.kernels.arrays import Floats, freeze
 
 FEWEST_ACROSS: Final = 8
 """Smallest number of voxels along each axis of a cropped scan."""
@@ -47,17 +47,13 @@ class Image:
         inverse = np.linalg.inv(self.affine_mm)
         return np.asarray(points_mm, dtype=np.float64) @ inverse[:3, :3].T + inverse[:3, 3]
 
-    def box_between(self, corners_mm: Floats) -> Ints:
-        """Return the voxel indices (2, 3) of the first and last voxel of the box that two points (2, 3) in mm span."""
-        index = np.rint(np.sort(self.to_index(corners_mm), axis=0))
-        return np.clip(index, 0, np.array(self.voxels.shape) - 1).astype(np.int32)
-
     def cropped(self, corners_mm: Floats) -> "Image":
         """Return the voxels of a box along the image axes, given two opposite corners (2, 3) in LPS mm.
 
         An InputError is raised when it holds too few voxels.
         """
-        first, last = self.box_between(corners_mm)
+        index = np.rint(np.sort(self.to_index(corners_mm), axis=0))
+        first, last = np.clip(index, 0, np.array(self.voxels.shape) - 1).astype(np.int32)
         if (last - first + 1 < FEWEST_ACROSS).any():
             raise InputError(
                 f"The crop box holds fewer than {FEWEST_ACROSS} voxels along an axis of the scan. Choose a larger box."

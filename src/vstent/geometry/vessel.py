@@ -28,8 +28,7 @@ class Opening:
     ``outlet_2``, ... from the widest outlet to the narrowest."""
 
     def __post_init__(self) -> None:
-        freeze(self, "center_mm", np.float64, (3,))
-        freeze(self, "normal", np.float64, (3,))
+        freeze(self, "center_mm normal", np.float64, (3,))
 
     @property
     def diameter_mm(self) -> float:

@@ -46,8 +46,7 @@ class Bulge:
     """Median depth of the lumen below its vertices; 0 where not measured."""
 
     def __post_init__(self) -> None:
-        freeze(self, "points_mm", np.float64, (-1, 3))
-        freeze(self, "foot_mm", np.float64, (-1, 3))
+        freeze(self, "points_mm foot_mm", np.float64, (-1, 3))
         freeze(self, "dome_mm", np.float64, (3,))
 
     @property

@@ -34,7 +34,7 @@ def porous_files(case: FlowCase, setup: FoamSetup) -> tuple[dict[str, str], dict
             surfaces[name] = {name: corners_mm}
             inside: dict[str, Any] = {
                 "file": f'"{setup.dialect.surfaces}/{name}.stl"',
-                "outsidePoints": [_outside(case)],
+                "outsidePoints": [tuple((case.vessel.inlet.center_mm * M_PER_MM).tolist())],
             }
             inside |= {"useSurfaceOrientation": True, "includeCut": False, "includeInside": True}
             inside |= {"includeOutside": False, "nearDistance": -1, "curvature": -100}
@@ -84,8 +84,3 @@ def _bands(case: FlowCase, region: Sheet) -> list[tuple[Floats, float, float]]:
         forchheimer = 0.5 * region.inertial_loss[here].mean() / M_PER_MM
         found.append(((low_mm + index * spacing_mm)[faces], float(darcy[here].mean()), float(forchheimer)))
     return found
-
-
-def _outside(case: FlowCase) -> tuple[float, ...]:
-    """Return a point outside the region, in m."""
-    return tuple(float(x) for x in case.vessel.inlet.center_mm * M_PER_MM)
