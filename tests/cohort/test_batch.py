@@ -329,7 +329,7 @@ def test_outliers_are_found_by_the_modified_z_score():
     assert modified_z_scores(values) == pytest.approx(wanted)
     key = "implant.deployed_length_mm"
     rows = [{"case": f"<c{i}>", "treatment": "silk", "outcome": "done", key: v} for i, v in enumerate(values)]
-    page = cohort_report("x", rows)
+    page = cohort_report("x", rows, {})
     outliers = page[page.index('id="outliers"') : page.index('id="failures"')]
     assert re.findall(r'<th scope="row">(.*?)</th>', outliers) == ["&lt;c5&gt;"]
     assert page.count("<circle") == 6

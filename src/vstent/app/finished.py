@@ -4,7 +4,7 @@ import glob
 import json
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from pydantic import ValidationError
 
@@ -12,12 +12,10 @@ from vstent.app.cases import STEPS, Case, Cases, State, dependencies
 from vstent.app.choices import Choices
 from vstent.devices.treatment import BARE
 from vstent.errors import InputError, ReadError
+from vstent.study.folder import CACHE, INPUT, RUN
+from vstent.study.settings import Settings
+from vstent.study.store import KEY_DIGITS, UNREADABLE, Store
 
-if TYPE_CHECKING:  # imported when a folder is read, as in `vstent.app.choices`
-    from vstent.study.settings import Settings
-
-RUN: Final = "run.json"
-"""File in which a study states its settings."""
 REPORT: Final = "report.html"
 """File of the case folder with the report."""
 REMEMBERED: Final = 256
@@ -54,7 +52,6 @@ def kept_histories(folder: Path) -> dict[str, Path]:
     if not flows:
         return {}
     from vstent.study.contrast import written
-    from vstent.study.store import KEY_DIGITS
 
     told, found = written(folder), {}
     for name, path in flows.items():
@@ -108,7 +105,6 @@ def _flows_told(run: Path, _written_ns: int) -> dict[str, Path]:
     The time of writing is a parameter so that a changed file is read again.
     """
     from vstent.study.repeat import told_in
-    from vstent.study.store import UNREADABLE
 
     try:
         told, settings = told_in(run)
@@ -117,11 +113,9 @@ def _flows_told(run: Path, _written_ns: int) -> dict[str, Path]:
         return {}
 
 
-def _paths(folder: Path, source: str, settings: "Settings") -> dict[str, Path]:
+def _paths(folder: Path, source: str, settings: Settings) -> dict[str, Path]:
     """Return the files in which a study stores its flows, by name."""
-    from vstent.study.folder import CACHE
     from vstent.study.keys import study_keys
-    from vstent.study.store import Store
 
     flows = {name: key for name, key in study_keys(source, settings).items() if name.startswith("flow ")}
     return {name.removeprefix("flow "): Store(folder / CACHE).path(name, key) for name, key in flows.items()}
@@ -133,9 +127,7 @@ def reopened(cases: Cases, folder: Path) -> Case:
     Raises ReadError: the folder does not state its input and settings, is from another version, or has a setting that
     the page does not support.
     """
-    from vstent.study.folder import CACHE, INPUT
     from vstent.study.repeat import told_in
-    from vstent.study.store import UNREADABLE
 
     try:
         told, settings = told_in(folder / RUN)

@@ -11,11 +11,12 @@ from typing import Any, Final
 from vstent.app import intake
 from vstent.app.cases import STATE, STEPS, Case, Cases, dependencies, failures, statuses
 from vstent.app.choices import pulse_of
-from vstent.app.finished import REPORT, RUN, are_flows_stored, kept_histories, lost_steps, reopened, shown_flows
+from vstent.app.finished import REPORT, are_flows_stored, kept_histories, lost_steps, reopened, shown_flows
 from vstent.app.jobs import KINDS, RANKING, Jobs
 from vstent.devices.treatment import BARE, Treatment
 from vstent.errors import InputError, ReadError
 from vstent.io.files import atomic, existing, state_of, suffix
+from vstent.study.folder import RUN
 
 PICTURE: Final = ".picture.png"
 """File of a case folder with its picture in the list of cases."""

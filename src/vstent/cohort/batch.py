@@ -11,7 +11,7 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from vstent.cohort.cases import Case
 from vstent.devices.treatment import BARE
@@ -44,11 +44,8 @@ LOST: Final = "lost"
 """Outcome where the process died; the next run repeats the case."""
 
 
-class OnCase(Protocol):
-    """Called when a case has ended."""
-
-    def __call__(self, done: int, total: int, name: str, rows: Sequence[Row]) -> None:
-        """Report that `done` of `total` cases have ended; the last one is called `name` and has these rows."""
+OnCase = Callable[[int, int, str, Sequence[Row]], None]
+"""Called when a case has ended, with the number of ended cases, that of all, and name and rows of this one."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ from vstent.devices.design import (
 )
 from vstent.devices.ranges import LENGTH
 from vstent.devices.treatment import BARE
-from vstent.errors import DeviceError
+from vstent.errors import DeviceError, VstentError
 
 LARGEST_MM: Final = 600.0
 """Largest diameter or length of a size that the schema accepts, in mm."""
@@ -46,15 +46,16 @@ _Length_mm = Annotated[float, Field(ge=0, le=LARGEST_MM)]
 _Margin_mm = Annotated[float, Field(ge=-1.5, le=1.5)]  # LEO: up to 1.2
 _Lengths_mm = Annotated[list[Annotated[float, Field(gt=0, le=LARGEST_MM)]], Field(min_length=1, max_length=MOST_SIZES)]
 Value = TypeVar("Value", int, float)
+Schema = TypeVar("Schema", bound=BaseModel)
 
 
-class _Strict(BaseModel):
+class Strict(BaseModel):
     """Entry without unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class _Sourced(_Strict):
+class _Sourced(Strict):
     """Entry with a source and a confidence."""
 
     source: _Words
@@ -65,7 +66,7 @@ class _Sourced(_Strict):
         yield Fact(name, self.source, self.confidence)
 
 
-class _Number(_Strict, Generic[Value]):
+class _Number(Strict, Generic[Value]):
     """Number of a group with its range. Source and reason are those of the group, unless it has its own."""
 
     value: Value
@@ -186,7 +187,7 @@ class _Sizes(_Sourced):
     reason: _Words
 
 
-class _Device(_Strict):
+class _Device(Strict):
     """Entry of a device of either family."""
 
     key: str = Field(pattern=r"^[a-z0-9_]+$")
@@ -313,10 +314,24 @@ class _Coil(_Device):
         return Coil(**self.shared())
 
 
-class _Catalogue(_Strict):
+class _Catalogue(Strict):
     """Content of a catalogue file."""
 
     device: list[Annotated[_Braid | _Basket | _LaserCut | _Coil, Field(discriminator="kind")]]
+
+
+def content(text: str, schema: type[Schema], name: str, error: type[VstentError]) -> Schema:
+    """Return TOML text in the form of a schema; an error of this class says where `name` breaks it."""
+    try:
+        return schema.model_validate(tomllib.loads(text))
+    except ValidationError as fault:
+        first = fault.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise error(f"{name} is wrong at {where}: {first['msg']}. Correct that entry.") from fault
+    except ValueError as fault:  # not TOML, or a number with thousands of digits
+        raise error(f"{name} is not valid TOML: {fault}. Correct that line.") from fault
+    except RecursionError:
+        raise error(f"{name} is nested too deeply: remove the inner brackets.") from None
 
 
 def parse(text: str, name: str = "The device catalogue") -> dict[str, Design]:
@@ -324,18 +339,7 @@ def parse(text: str, name: str = "The device catalogue") -> dict[str, Design]:
 
     A DeviceError is raised if the text is not TOML, breaks the schema or lists a device twice.
     """
-    try:
-        found = _Catalogue.model_validate(tomllib.loads(text)).device
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise DeviceError(f"{name} is wrong at {where}: {first['msg']}. Correct that entry.") from error
-    except ValueError as error:  # not TOML, or a number with thousands of digits
-        raise DeviceError(f"{name} is not valid TOML: {error}. Correct that line.") from error
-    except RecursionError:
-        raise DeviceError(
-            f"{name} is nested too deeply to be a catalogue. Give it the form of catalogue.toml."
-        ) from None
+    found = content(text, _Catalogue, name, DeviceError).device
     designs = {entry.key: entry.design() for entry in found}
     words = called(designs.values())
     if len(designs) < len(found) or len(set(words)) < len(words):

@@ -1,7 +1,6 @@
 """Criteria for devices and sizes, each with its limits, its weight and its source."""
 
 import difflib
-import tomllib
 from dataclasses import dataclass
 from functools import cache
 from math import inf
@@ -9,9 +8,10 @@ from pathlib import Path
 from typing import Annotated, Final, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from pydantic import Field, FiniteFloat, model_validator
 
 from vstent.devices.design import Design
+from vstent.devices.schema import Strict, content
 from vstent.errors import InputError
 from vstent.io.files import existing
 
@@ -63,13 +63,7 @@ MEASURES: Final = (
 from `vstent.plan.rank_flow.rank_flows`."""
 
 
-class _Strict(BaseModel):
-    """Entry without unknown keys."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Criterion(_Strict):
+class Criterion(Strict):
     """Rule that grades one measure of a deployed device."""
 
     key: str
@@ -129,7 +123,7 @@ class Criteria:
         return tuple(item for item in self.items if item.weight > 0 and item.kind in (None, design.kind))
 
 
-class _File(_Strict):
+class _File(Strict):
     """Content of a file of criteria."""
 
     criterion: list[Criterion] = Field(min_length=1)
@@ -160,14 +154,7 @@ def parse(text: str, name: str = "The file of criteria", known: tuple[str, ...] 
 
     An InputError says that the text is not TOML or breaks the schema, all weights are 0, or a measure does not exist.
     """
-    try:
-        items = _File.model_validate(tomllib.loads(text)).criterion
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{name} is not valid TOML: {error}. Correct that line.") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"{name} is wrong at {where}: {first['msg']}. Correct that entry.") from error
+    items = content(text, _File, name, InputError).criterion
     if not any(item.weight > 0 for item in items):
         raise InputError(f"{name} gives no criterion a weight. Give at least one a weight above 0.")
     for key in (item.key for item in items if item.key not in known):

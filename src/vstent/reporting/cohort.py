@@ -3,7 +3,6 @@
 import base64
 import math
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -36,8 +35,6 @@ HEADLINES: Final = (
 """Keys of the table columns that are drawn and searched for outliers; the end of each key is its unit."""
 UNDER_PICTURE: Final = ("implant.deployed_length_mm", "implant.neck_metal_coverage_fraction")
 """Keys of the metrics that stand under the picture of a patient."""
-EMPTY: Final[Mapping[tuple[str, str], bytes]] = MappingProxyType({})
-"""No pictures."""
 OUTLYING: Final = 3.5
 """Absolute modified z-score above which a value is an outlier.
 
@@ -79,7 +76,7 @@ class Outlier(NamedTuple):
     """Modified z-score, signed."""
 
 
-def cohort_report(name: str, rows: Sequence[Row], pictures: Mapping[tuple[str, str], bytes] = EMPTY) -> str:
+def cohort_report(name: str, rows: Sequence[Row], pictures: Mapping[tuple[str, str], bytes]) -> str:
     """Return the report of a cohort as the text of one HTML file that loads nothing from a network.
 
     A row per case and treatment has ``case``, ``treatment``, ``outcome``, ``stage``, ``sentence`` and metrics; pictures

@@ -50,20 +50,11 @@ def plan_pdf(case: Planned) -> bytes:
     from matplotlib import rc_context
 
     with rc_context({"pdf.fonttype": 42, "font.family": "DejaVu Sans"}):
-        vessel = _vessel_rows(case.anatomy)
-        pages = [
-            partial(
-                _write,
-                case=case,
-                title=title,
-                deployment=deployment,
-                metrics=case.metrics[name][key],
-                picture=_picture(case, name),
-                vessel=vessel,
-                others=_size_rows(case, deployment.stent, case.metrics[name][key]),
-            )
-            for name, key, title, deployment in titled(case.implants)
-        ]
+        vessel, pages = _vessel_rows(case.anatomy), []
+        for name, key, title, deployment in titled(case.implants):
+            metrics = case.metrics[name][key]
+            others = _size_rows(case, deployment.stent, metrics)
+            pages.append(partial(_write, case, title, deployment, metrics, _picture(case, name), vessel, others))
         scales = [*map(scale_of, pages)]
         paper = Paper(case.name, "plan", scale=scales[0])
         for number, (page, scale) in enumerate(zip(pages, scales, strict=True)):
@@ -74,7 +65,6 @@ def plan_pdf(case: Planned) -> bytes:
 
 
 def _write(
-    paper: Paper,
     case: Planned,
     title: str,
     deployment: Deployment,
@@ -82,6 +72,7 @@ def _write(
     picture: Picture,
     vessel: Sequence[tuple[str, str]],
     others: Sequence[tuple[str, str, str]],
+    paper: Paper,
 ) -> None:
     """Write the page of one implant; `others` are size, score and reason of alternatives."""
     paper.title(f"{case.name}: {title}")
