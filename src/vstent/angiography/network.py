@@ -5,8 +5,6 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from vstent.angiography.balance import Balancer
 from vstent.errors import FlowError
@@ -14,6 +12,7 @@ from vstent.flow import domain as domains
 from vstent.flow.case import FlowCase, FlowField, Level
 from vstent.flow.sampling import uniform
 from vstent.geometry.surface import Surface
+from vstent.kernels import triangles
 from vstent.kernels.arrays import Bools, Floats, Ints, freeze, unique_rows
 
 MM3_PER_ML: Final = 1e3
@@ -177,8 +176,7 @@ def network(case: FlowCase, field: FlowField) -> Network:
     left, axis = np.nonzero(is_open[:, ALONG_AXES])
     right = neighbour[left, 2 * axis + 1]
     mouths = _mouths(case, grid, neighbour, surface, face_patch)
-    graph = coo_matrix((np.ones(len(left)), (left, right)), shape=(len(grid.cells),) * 2)
-    part = connected_components(graph, directed=False)[1]
+    part = triangles.joined(np.stack([left, right], axis=1), len(grid.cells))
     kept = np.isin(part, part[mouths[mouths[:, 3] < n_inlets, 0]])
     if not kept.any():
         raise FlowError("no cell of the flow lies at an inlet, so no contrast can enter: compute the flow again")

@@ -68,8 +68,7 @@ class Stent:
     @cached_property
     def contour(self) -> Surface:
         """Contour as triangles with outward normals; vertex (row, column) has the number row * columns + column."""
-        rows, columns = self.nodes_mm.shape[:2]
-        return Surface(self.nodes_mm.reshape(-1, 3), tube_faces(rows, columns))
+        return Surface(self.nodes_mm.reshape(-1, 3), tube_faces(*self.nodes_mm.shape[:2]))
 
     @property
     def point_wires(self) -> Ints:

@@ -14,7 +14,6 @@ from vstent.flow.settings import Blood, Numerics
 from vstent.flow.waveform import Waveform
 from vstent.geometry.surface import Surface, joined
 from vstent.geometry.vessel import Vessel
-from vstent.kernels import voxels
 from vstent.kernels.arrays import Bools, Floats, Ints, freeze, read_only
 from vstent.kernels.directions import VELOCITIES
 
@@ -200,7 +199,9 @@ class Cells:
     @cached_property
     def index(self) -> Ints:
         """Index of the cell at every grid point (i, j, k), -1 outside the blood."""
-        return voxels.index_of(self.cells)
+        index = np.full(self.cells.max(axis=0) + 2, -1, dtype=np.int32)
+        index[tuple(self.cells.T)] = np.arange(len(self.cells), dtype=np.int32)
+        return index
 
     def neighbours(self) -> Ints:
         """Return the cell indices (n, 19) of every cell's neighbours, -1 where they are not blood."""

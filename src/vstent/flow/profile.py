@@ -7,7 +7,7 @@ from scipy import ndimage, sparse
 from scipy.sparse.linalg import spsolve
 from scipy.special import jv
 
-from vstent.kernels import curves
+from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Complex, Floats
 from vstent.units import M_PER_MM
 
@@ -45,9 +45,7 @@ def pulsating_profiles(
     Womersley 1955, J. Physiol. 127, 553.
     """
     speed, inside = _developed(section_mm, normal, points_mm)
-    around_mm = section_mm - section_mm.mean(axis=0)
-    area_mm2 = abs(float(np.cross(around_mm, np.roll(around_mm, -1, axis=0)).sum(axis=0) @ normal)) / 2
-    radius_m = np.sqrt(area_mm2 / np.pi) * M_PER_MM
+    radius_m = np.sqrt(abs(triangles.polygon_area_vector(section_mm) @ normal) / np.pi) * M_PER_MM
     number = radius_m * np.sqrt(rate_per_s[:, None] / viscosity_m2_s) * 1j**1.5
 
     def unscaled(of_speed: Floats) -> Complex:

@@ -3,12 +3,10 @@
 from typing import Final
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from vstent.geometry.surface import Surface
 from vstent.kernels import topology, triangles
-from vstent.kernels.arrays import Bools, Floats, Ints
+from vstent.kernels.arrays import Floats, Ints
 
 SHARP_COSINE: Final = 0.5
 """Cosine of the angle between the normals of neighboring faces below which an edge is sharp, as at the rims that join
@@ -48,18 +46,10 @@ def inner_wall(surface: Surface) -> Surface | None:
 
 def _smooth_parts(points_mm: Floats, faces: Ints) -> Ints:
     """Return the number (m,) of the part that every face belongs to; sharp and open edges separate parts."""
-    corners = points_mm[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    order = np.lexsort(edges.T)
-    face = np.repeat(np.arange(len(faces)), 3)[order]
-    is_same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
-    first, second = face[:-1][is_same], face[1:][is_same]
+    normal, pairs = triangles.normals(points_mm[faces]), topology.face_neighbours(faces)
     # The two walls may have equal or opposite orientation, so the sign of the normals is ignored.
-    is_smooth: Bools = np.abs(np.einsum("ij,ij->i", normal[first], normal[second])) > SHARP_COSINE
-    links = coo_array((np.ones(is_smooth.sum()), (first[is_smooth], second[is_smooth])), shape=(len(faces),) * 2)
-    return np.asarray(connected_components(links, directed=False)[1])
+    is_smooth = np.abs(np.einsum("ij,ij->i", normal[pairs[:, 0]], normal[pairs[:, 1]])) > SHARP_COSINE
+    return triangles.joined(pairs[is_smooth], len(faces))
 
 
 def _is_around(inner: Surface, outer: Surface) -> bool:

@@ -67,13 +67,6 @@ def dilate(mask: Bools, offsets: NDArray[Any]) -> Bools:
     return result
 
 
-def index_of(cells: Ints) -> Ints:
-    """Return the number of the cell at every grid point (i, j, k), -1 outside, from cell coordinates (n, 3)."""
-    index = np.full(cells.max(axis=0) + 2, -1, dtype=np.int32)
-    index[tuple(cells.T)] = np.arange(len(cells), dtype=np.int32)
-    return index
-
-
 def isosurface(field: NDArray[np.float32], level: float) -> tuple[Floats, Ints]:
     """Return vertices (n, 3) in index units and faces (m, 3), counter-clockwise seen from the low side.
 

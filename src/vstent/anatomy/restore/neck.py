@@ -22,7 +22,7 @@ from scipy.special import ndtr, ndtri
 from vstent.anatomy.restore.landing import Landing
 from vstent.anatomy.restore.tubes import Tubes
 from vstent.geometry.surface import Surface
-from vstent.kernels import curves
+from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Floats, Ints
 
 CLEAR: Final = 1.9
@@ -161,19 +161,10 @@ class Flank(NamedTuple):
 
     def isoline(self, height_mm: float) -> Floats:
         """Return closely spaced points (j, 3) on the contour line at `height_mm`."""
-        points = self.vertices_mm
         level = np.where(np.abs(self.height_mm - height_mm) < 1e-12, 1e-12, self.height_mm - height_mm)
-        is_above = level[self.faces] > 0
-        cut = np.flatnonzero((is_above.sum(axis=1) % 3) != 0)
-        is_lone = np.where((is_above[cut].sum(axis=1) == 1)[:, None], is_above[cut], ~is_above[cut])
-        lone = (is_lone.argmax(axis=1)[:, None] + np.arange(3)) % 3
-        a, b, c = np.take_along_axis(self.faces[cut], lone, axis=1).T
-        ends = [
-            points[a] + (level[a] / (level[a] - level[other]))[:, None] * (points[other] - points[a])
-            for other in (b, c)
-        ]
+        first, last = np.moveaxis(triangles.section(self.vertices_mm, self.faces, level), 1, 0)
         share = np.linspace(0.0, 1.0, 8, endpoint=False)[:, None, None]
-        return np.asarray((ends[0] + share * (ends[1] - ends[0])).reshape(-1, 3))
+        return np.asarray((first + share * (last - first)).reshape(-1, 3))
 
 
 def believed_from_mm(lumen: Surface, foot_mm: Floats, most_mm: float, blur_mm: float | None) -> float:

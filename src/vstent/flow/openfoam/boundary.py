@@ -18,7 +18,7 @@ from vstent.flow.openfoam.dictionary import foam_file, vector
 from vstent.flow.openfoam.setup import FoamSetup
 from vstent.flow.profile import distance_inside
 from vstent.geometry.vessel import Opening
-from vstent.kernels import curves
+from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Floats
 from vstent.units import M3_PER_ML, M_PER_MM
 
@@ -148,7 +148,7 @@ def _profiled(case: FlowCase, setup: FoamSetup, opening: Opening, end: Inflow, s
     a, b = (x.ravel() for x in np.meshgrid(ticks_mm, ticks_mm))
     points_mm = center_mm + a[:, None] * first + b[:, None] * second
     section = section_mm, opening.normal, points_mm
-    area_mm2 = abs(float(np.cross(around_mm, np.roll(around_mm, -1, axis=0)).sum(axis=0) @ inward)) / 2
+    area_mm2 = abs(float(triangles.polygon_area_vector(section_mm) @ inward))
     mean_m_s, time_s = end.mean_mL_s / area_mm2, np.zeros(1)
     shape = end.relative_velocity(*section)
     shapes, factor = shape[None], np.ones(1)

@@ -19,12 +19,13 @@ from vstent.flow.ends import outflows
 from vstent.flow.engines import AbstractEngine, Outcome, Saved
 from vstent.flow.openfoam import folder as folders
 from vstent.flow.openfoam import program, results
-from vstent.flow.openfoam.boundary import cycle_s
+from vstent.flow.openfoam.boundary import cycle_s, flow_table, table_name
 from vstent.flow.openfoam.bridge import Bridge, Snapshot, bridge, read
 from vstent.flow.openfoam.case import foam_case, strut_solids
 from vstent.flow.openfoam.cost import memory_bytes, tell_cost
 from vstent.flow.openfoam.setup import CHECK_ITERATIONS, ITERATIONS, FoamSetup
 from vstent.flow.stopping import cycle_change, cycles_advice, quantities_left
+from vstent.io.writers import write_text
 from vstent.kernels.arrays import Floats, Ints
 
 CHECKS_AVERAGED: Final = 8
@@ -265,7 +266,7 @@ def _follow(state: State) -> float:
     for k, outlet in enumerate(case.vessel.outlets[1:], start=1):
         table_s = cycle_s(case)
         finer = np.interp(table_s, time_s % table_s[-1], flow_mL_s[:, k], period=table_s[-1])
-        folders.set_outflow(state.folder, outlet.role, table_s, finer)
+        write_text(state.folder / "constant" / table_name(outlet.role), flow_table(table_s, finer))
     return float(np.abs(wrong_mL_s).max()) / case.inflow_mL_s
 
 

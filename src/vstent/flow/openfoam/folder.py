@@ -11,12 +11,10 @@ import numpy as np
 from vstent.flow import sampling
 from vstent.flow.case import FlowField
 from vstent.flow.openfoam import program, results
-from vstent.flow.openfoam.boundary import flow_table, table_name
 from vstent.flow.openfoam.case import SCRIPTS, FoamCase
 from vstent.flow.openfoam.dictionary import vector
 from vstent.flow.openfoam.setup import FoamSetup
 from vstent.io.writers import write_text
-from vstent.kernels.arrays import Floats
 from vstent.units import M3_PER_ML, M_PER_MM
 
 KEY: Final = "vstent.key"
@@ -114,8 +112,3 @@ def scale_inflow(folder: Path, inlet: str, factor: float) -> bool:
         mean = [factor * float(x) for x in lines[-1].strip("()").split()]
         write_text(path, "\n".join([*lines[:-1], vector(mean), ""]))
     return bool(paths)
-
-
-def set_outflow(folder: Path, outlet: str, time_s: Floats, flow_mL_s: Floats) -> None:
-    """Write the flow rates (t,) at times (t,) that an outlet with a resistance prescribes."""
-    write_text(folder / "constant" / table_name(outlet), flow_table(time_s, flow_mL_s))

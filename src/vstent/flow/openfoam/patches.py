@@ -7,6 +7,7 @@ import numpy as np
 from vstent.flow.case import FlowCase
 from vstent.flow.domain import extend
 from vstent.geometry.surface import Surface
+from vstent.kernels import triangles
 from vstent.kernels.arrays import Floats, Ints, freeze
 
 ON_SAC_MM = 1e-3
@@ -63,8 +64,6 @@ def stl_text(solids: dict[str, Floats], scale: float) -> str:
     text = ""
     for name, corners in solids.items():
         scaled = corners * scale
-        normal = np.cross(scaled[:, 1] - scaled[:, 0], scaled[:, 2] - scaled[:, 0])
-        normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-        rows = np.concatenate([normal, scaled.reshape(-1, 9)], axis=1)
+        rows = np.concatenate([triangles.normals(scaled), scaled.reshape(-1, 9)], axis=1)
         text += f"solid {name}\n" + "".join(face % tuple(row) for row in rows) + f"endsolid {name}\n"
     return text
