@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from vstent.app.choices import Choices
 from vstent.errors import InputError, ReadError
-from vstent.io.files import atomic
+from vstent.io.files import write_bytes
 from vstent.study.folder import refuse_older
 from vstent.study.settings import Settings
 
@@ -211,8 +211,7 @@ class Case:
         """Change the state, store it, and notify all clients."""
         with self._lock:
             self._state = self._state.model_copy(update=changes)
-            with atomic(self.folder / STATE) as partial:
-                partial.write_text(self._state.model_dump_json(indent=1), encoding="utf-8")
+            write_bytes(self.folder / STATE, self._state.model_dump_json(indent=1).encode())
         self.tell()
         return self._state
 

@@ -15,7 +15,7 @@ from vstent.app.finished import REPORT, are_flows_stored, kept_histories, lost_s
 from vstent.app.jobs import KINDS, RANKING, Jobs
 from vstent.devices.treatment import BARE, Treatment
 from vstent.errors import InputError, ReadError
-from vstent.io.files import atomic, existing, state_of, suffix
+from vstent.io.files import existing, state_of, suffix, write_bytes
 from vstent.study.folder import RUN
 
 PICTURE: Final = ".picture.png"
@@ -340,8 +340,7 @@ def keep_picture(case: Case, data: bytes) -> None:
     """
     if not data.startswith(b"\x89PNG\r\n\x1a\n"):
         raise InputError("The picture of a case must be a PNG file.")
-    with atomic(case.folder / PICTURE) as partial:
-        partial.write_bytes(data)
+    write_bytes(case.folder / PICTURE, data)
 
 
 def begin_upload(case: Case, name: str) -> Path:

@@ -96,7 +96,7 @@ def _fit(arguments: argparse.Namespace) -> int:
     from vstent.devices.measurements import TEMPLATE, read_measurements
     from vstent.devices.schema import parse
     from vstent.errors import InputError
-    from vstent.io.files import atomic
+    from vstent.io.files import write_bytes
     from vstent.io.writers import write_text
     from vstent.reporting.device_fit import picture
 
@@ -114,8 +114,7 @@ def _fit(arguments: argparse.Namespace) -> int:
     text = entry(fitted, like, name, source=arguments.file.name, has_all_sizes=arguments.all_sizes)
     parse(text, "The fitted entry")  # refuses a device that cannot be made
     write_text(arguments.out, text)
-    with atomic(arguments.out.with_suffix(".png")) as partial:
-        partial.write_bytes(picture(fitted, name))
+    write_bytes(arguments.out.with_suffix(".png"), picture(fitted, name))
     console.print(fit_table(fitted))
     console.print(correlation_table(fitted))
     console.print(

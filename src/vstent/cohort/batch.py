@@ -16,7 +16,7 @@ from typing import Any, Final
 from vstent.cohort.cases import Case
 from vstent.devices.treatment import BARE
 from vstent.errors import VstentError
-from vstent.io.files import atomic
+from vstent.io.files import write_bytes
 from vstent.io.tables import write_parquet, write_rows
 from vstent.io.writers import write_text
 from vstent.reporting.figures import patient_picture
@@ -147,8 +147,7 @@ def _rows(task: Task) -> dict[str, Row]:
         def with_treatment(progress: OnProgress, name: str = name, settings: Settings = settings) -> None:
             found = run(case.path, study, settings, progress, replaces=True)
             implants = list(found.implants[name].values())
-            with atomic(task.folder / f"{name}.webp") as partial:
-                partial.write_bytes(patient_picture(found.anatomy, implants).webp)
+            write_bytes(task.folder / f"{name}.webp", patient_picture(found.anatomy, implants).webp)
             advice = " ".join(one.advice for one in implants)
             rows[name] = {"outcome": DONE, "stage": "", "sentence": advice} | flat_metrics(found.metrics, name)
 

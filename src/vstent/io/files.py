@@ -118,6 +118,12 @@ def atomic(path: Path) -> Iterator[Path]:
             os.unlink(name)
 
 
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file, which is complete or does not exist."""
+    with atomic(path) as partial:
+        partial.write_bytes(content)
+
+
 @contextmanager
 def atomic_folder(folder: Path) -> Iterator[Path]:
     """Yield a temporary folder that replaces `folder` on success and is removed on failure."""

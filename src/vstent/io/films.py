@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vstent.io.files import atomic, atomic_folder
+from vstent.io.files import atomic_folder, write_bytes
 
 WEBP_QUALITY: Final = 80
 """Quality of an animated WebP, 0 to 100, as defined by Pillow."""
@@ -27,8 +27,7 @@ def write_frames(folder: Path, frames: Frames) -> None:
 
 def write_animation(path: Path, frames: Frames, frame_time_s: float) -> None:
     """Write an animation that repeats without end, as ``.webp`` (lossy, small) or ``.png`` (lossless)."""
-    with atomic(path) as partial:
-        partial.write_bytes(animation(frames, frame_time_s, path.suffix.lower()))
+    write_bytes(path, animation(frames, frame_time_s, path.suffix.lower()))
 
 
 def animation(frames: Frames, frame_time_s: float, suffix: str = ".webp") -> bytes:

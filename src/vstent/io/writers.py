@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Centerline
-from vstent.io.files import atomic, silenced
+from vstent.io.files import atomic, silenced, write_bytes
 from vstent.kernels.arrays import Floats, Ints
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -180,8 +180,7 @@ def write_stl(path: Path, surface: Surface) -> None:
     faces = np.zeros(len(surface.faces), dtype=_STL_FACE)
     faces["normal"], faces["corners"] = surface.normals, surface.corners_mm
     header = f"vstent, mm, SPACE={SPACE}".encode().ljust(80) + len(faces).to_bytes(4, "little")
-    with atomic(path) as partial:
-        partial.write_bytes(header + faces.tobytes())
+    write_bytes(path, header + faces.tobytes())
 
 
 def write_json(path: Path, content: Any, *, is_exact: bool = False) -> None:
@@ -215,5 +214,4 @@ def _plain(value: Any, where: str, is_exact: bool) -> Any:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file in UTF-8."""
-    with atomic(path) as partial:
-        partial.write_text(text, encoding="utf-8", newline="\n")
+    write_bytes(path, text.encode())

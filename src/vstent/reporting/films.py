@@ -13,7 +13,7 @@ from vstent.angiography.film import Film, film_of, levels_of, window_of, wire_sh
 from vstent.angiography.filming import FilmSettings, projectors_of, view_for
 from vstent.angiography.history import History
 from vstent.devices.stent import Stent
-from vstent.io.files import atomic
+from vstent.io.files import write_bytes
 from vstent.io.films import write_animation, write_frames
 from vstent.io.writers import write_json
 from vstent.io.xa_writer import BITS, XaHeader, write_xa
@@ -203,8 +203,7 @@ def write_films(
     write_animation(out / ANIMATION, beside(films, window), 1.0 / films[0].film.frame_rate_Hz)
     pictures = [key_frames(films, window), *([density_picture(densities)] if densities else [])]
     for picture in pictures:
-        with atomic(out / f"{picture.id}.png") as partial:
-            partial.write_bytes(picture.png)
+        write_bytes(out / f"{picture.id}.png", picture.png)
     told = [{"id": one.id, "title": one.title, "caption": one.caption} for one in pictures]
     write_json(out / INDEX, {"pictures": told, "films": {name: one.title for name, one in shown.items()}})
     return [*written, ANIMATION, *(f"{picture.id}.png" for picture in pictures), INDEX]

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from vstent.io.files import atomic
+from vstent.io.files import write_bytes
 from vstent.io.writers import write_text
 from vstent.reporting.drawing import Drawing
 from vstent.reporting.films import KeptFilms, kept_films
@@ -30,8 +30,7 @@ def write_plan(case: "CaseResult", out: Path, day: str) -> None:
     metrics = {name: case.metrics["treatments"][name]["implants"] for name in case.implants}
     anatomy = replace(case.anatomy, notes=(*straightening_notes(case.metrics), *case.anatomy.notes))
     planned = Planned(case.name, anatomy, case.implants, metrics, case.provenance["input"]["sha256"], day)
-    with atomic(out / "plan.pdf") as partial:
-        partial.write_bytes(plan_pdf(planned))
+    write_bytes(out / "plan.pdf", plan_pdf(planned))
 
 
 def write_report(case: "CaseResult", out: Path, *, is_printed: bool = False, drawing: Drawing | None = None) -> None:
@@ -61,6 +60,5 @@ def _write(case: "CaseResult", out: Path, names: list[str], drawing: Drawing | N
         told = replace(told, pictures=(*told.pictures, *films.pictures), film=films.animation)
     write_text(out / "report.html", as_html(told))
     if "report.pdf" in names:
-        with atomic(out / "report.pdf") as partial:
-            partial.write_bytes(as_pdf(told))
+        write_bytes(out / "report.pdf", as_pdf(told))
     return ""

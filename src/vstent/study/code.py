@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
-from vstent.io.files import atomic, state_of
+from vstent.io.files import state_of, write_bytes
 from vstent.kernels.cache import cache_folder
 from vstent.study.store import UNREADABLE, digest
 
@@ -48,8 +48,8 @@ def code_of(entry: str, without: tuple[str, ...] = ()) -> str:
         _, found[name], imports = memory[name]
         todo += imports
     if is_new:
-        with suppress(OSError), atomic(cache_folder(PACKAGE) / REMEMBERED) as partial:
-            partial.write_text(json.dumps(memory), encoding="utf-8")
+        with suppress(OSError):
+            write_bytes(cache_folder(PACKAGE) / REMEMBERED, json.dumps(memory).encode())
     return digest(sorted(found.items()))
 
 

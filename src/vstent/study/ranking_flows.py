@@ -13,7 +13,7 @@ from vstent.flow.problem import flow_case
 from vstent.flow.settings import FlowSettings
 from vstent.flow.simulation import memory_bytes
 from vstent.geometry.vessel import Anatomy
-from vstent.io.files import atomic
+from vstent.io.files import write_bytes
 from vstent.plan.rank import Candidate
 from vstent.plan.rank_flow import coverage_of, flow_with, is_finished, nearest, stent_of
 from vstent.study.folder import CACHE
@@ -153,8 +153,7 @@ def parallel_flows(
 
 def write_pickle(path: Path, what: Any) -> None:
     """Write an object, so that a file of this name is always whole."""
-    with atomic(path) as partial:
-        partial.write_bytes(pickle.dumps(what))
+    write_bytes(path, pickle.dumps(what))
 
 
 def _read_pickle(path: Path) -> Any:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 from vstent.errors import VstentError
-from vstent.io.files import atomic, states_of
+from vstent.io.files import atomic, states_of, write_bytes
 from vstent.study.progress import OnProgress, Progress
 
 if TYPE_CHECKING:
@@ -216,8 +216,7 @@ class Store:
         The latest flows by the same code are kept. The record states the run time of every stage that the result took,
         and values or states of files.
         """
-        with atomic(self.path(name, key, ".json")) as partial_file:
-            partial_file.write_text(json.dumps({"seconds": seconds} | more), encoding="utf-8")
+        write_bytes(self.path(name, key, ".json"), json.dumps({"seconds": seconds} | more).encode())
         files = self._files(name)
         alike = [file for file in files if file.name.endswith(f"-{key.code}.json") and name.startswith("flow ")]
         alike.sort(key=lambda file: file.stat().st_mtime_ns)
