@@ -293,12 +293,14 @@ class _Runs:
             return replace(field, advice=f"{field.advice} The screen is not calibrated, because pores are too wide.")
         similar, factor, size_mm = self.similar, 1.0, default_cell_size_mm(case)
         rounds: list[tuple[float, float, float]] = []
+        tile: calibration.Tile | None = None
         for number in range(runs - 1):
             steady = replace(calibration.scaled(case, factor), waveform=None)
             progress = self._part(number / runs, (number + 1) / runs)
             now = replace(self, prefix=f"round {number} ", progress=progress, similar=similar)
             similar = now.answer(steady, start)
-            rounds.append((factor, *calibration.read_off(steady, similar, size_mm)))
+            tile = tile or calibration.strongest(steady, similar)
+            rounds.append((factor, *calibration.read_off(steady, tile, similar, size_mm)))
             factor = calibration.next_factor(rounds)
         last = replace(self, progress=self._part(1 - 1 / runs, 1.0), similar=similar)
         field = last.answer(calibration.scaled(case, factor), start)

@@ -15,7 +15,7 @@ from vstent.flow import simulation
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.indices import indices, neck_diameter_mm
-from vstent.flow.lattice import calibration
+from vstent.flow.lattice import calibration, stepping
 from vstent.flow.lattice.cost import estimate
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.levels import sizes_mm
@@ -62,7 +62,7 @@ def test_a_screen_is_calibrated_to_what_stands_for_its_wires(
 ) -> None:
     """With a known screen in place of the walls: its flow is found from half and from twice its resistance."""
     known = with_numerics(braided, cell_size_mm=CELL_MM)
-    monkeypatch.setattr(calibration, "tile", lambda *_: known)
+    monkeypatch.setattr(calibration.Tile, "walls", lambda *_: known)
     wanted = found(simulate_case(known), known)
     begun = calibration.scaled(known, times)
     assert (np.abs(found(simulate_case(begun), begun) / wanted - 1) > 0.1)[:2].all()
@@ -76,7 +76,7 @@ def test_a_tile_has_the_walls_near_a_point_and_the_screen_elsewhere(braided: Flo
     case = with_numerics(braided, cell_size_mm=CELL_MM)
     assert case.ostium is not None
     center_mm = case.ostium.vertices_mm.mean(axis=0)
-    walls = calibration.tile(case, center_mm)
+    walls = calibration.tile_at(case, center_mm).walls(case)
     assert walls.wires is not None
     away_mm = np.linalg.norm(walls.wires.corners_mm.mean(axis=1) - center_mm, axis=1)
     assert away_mm.max() < calibration.TILE_MM + 0.05
@@ -125,6 +125,18 @@ def test_a_narrow_neck_with_a_screen_has_a_finer_level_unless_the_spacing_is_giv
     assert sizes_mm(with_numerics(braided, device_gpu=True), open_mm) == (open_mm,)
     field = simulate_case(with_numerics(braided, cell_size_mm=CELL_MM))
     assert f"Under-resolved neck: it has {across_mm / CELL_MM:.0f} cells across" in field.advice
+
+
+def test_devices_share_the_grids_around_a_neck_and_those_of_walls_do_not_pile_up(braided: FlowCase) -> None:
+    case = with_numerics(braided, cells_per_diameter=18.0)
+    other = replace(case, solids=tuple(replace(one) for one in case.solids))
+    size_mm = default_cell_size_mm(case)
+    first, second = (stepping._grids(one, size_mm) for one in (case, other))
+    assert first[1][0] is second[1][0]
+    for thickness_um in (300.0, 310.0):  # walls of the grid itself
+        solids = tuple(replace(one, wire_diameter_um=0 * one.wire_diameter_um + thickness_um) for one in case.solids)
+        stepping._grids(with_numerics(replace(case, solids=solids), wires="resolved", cell_size_mm=0.12), 0.12)
+    assert sum(bool(solids) for _, _, solids in stepping._GRIDS[case.vessel]) == 1
 
 
 def test_the_finer_level_contains_the_screen(braided: FlowCase) -> None:

@@ -76,8 +76,8 @@ BESIDE_NECK: Final = 6.0
 MARGIN_CELLS: Final = 14.0
 """Distance in cells by which a refined part around wires exceeds the next finer one: with less, the distance kept from
 the border and `RIM` leave no room for that along diagonals."""
-SCREEN_CELLS: Final = 2.0
-"""Further distance in cells around a screen, which is spread over layers of cells."""
+SCREEN_CELLS: Final = 4.0
+"""Distance in cells from a neck with a screen, which is spread over layers of cells, up to which a grid is refined."""
 CHANGING: Final = ("crossed", "lack", "push")
 """Arrays of an `Interface` that change during a run."""
 CHUNK: Final = 10_000
@@ -207,15 +207,21 @@ def near_narrow(case: FlowCase, grid: Domain) -> Bools:
 
 
 def _reach_mm(case: FlowCase, size_mm: float, finest_mm: float) -> float:
-    """Return the distance from wires to which a grid with this spacing is refined: their thickness at the finest."""
+    """Return the distance to which a grid with this spacing is refined around wires or a neck (see `_around`)."""
     assert case.wires is not None
-    own_mm = 0.0 if case.numerics.wires == "resolved" else SCREEN_CELLS * size_mm
-    return own_mm + thickness_mm(case.wires) + MARGIN_CELLS * max(0.0, size_mm - WIDTH * finest_mm)
+    own_mm = thickness_mm(case.wires) if case.numerics.wires == "resolved" else SCREEN_CELLS * size_mm
+    return own_mm + MARGIN_CELLS * max(0.0, size_mm - WIDTH * finest_mm)
 
 
-def _walls(case: FlowCase) -> Surface:
-    """Return the part of the wires that finer levels take as walls: all in the sac and near its neck."""
+def _around(case: FlowCase) -> Surface:
+    """Return what finer levels lie around: wires that are walls, in the sac and near its neck, or a neck with a screen.
+
+    The latter is the same for all devices in a vessel, which share the grids.
+    """
     assert case.wires is not None
+    if case.numerics.wires != "resolved":
+        assert case.ostium is not None
+        return case.ostium
     if case.sac is None:
         return case.wires
     is_near = case.sac.signed_distance(case.wires.corners_mm.mean(axis=1)) < BESIDE_NECK * thickness_mm(case.wires)
@@ -241,18 +247,18 @@ def beside_walls(case: FlowCase, blood_mm: Floats) -> FlowCase:
 
 
 def near_wires(case: FlowCase, grid: Domain, finest_mm: float) -> Bools:
-    """Return whether each cell (n,) lies near wires that finer levels take as walls, the finest with this spacing."""
-    wires, reach_mm = _walls(case), _reach_mm(case, grid.cell_size_mm, finest_mm)
-    low, high = wires.vertices_mm.min(axis=0) - reach_mm, wires.vertices_mm.max(axis=0) + reach_mm
+    """Return whether each cell (n,) lies near the wires or the neck of a case, where the finest has this spacing."""
+    around, reach_mm = _around(case), _reach_mm(case, grid.cell_size_mm, finest_mm)
+    low, high = around.vertices_mm.min(axis=0) - reach_mm, around.vertices_mm.max(axis=0) + reach_mm
     result = ((grid.centers_mm > low) & (grid.centers_mm < high)).all(axis=1)
-    result[result] = wires.closest(grid.centers_mm[result])[1] < reach_mm
+    result[result] = around.closest(grid.centers_mm[result])[1] < reach_mm
     return result
 
 
 def volume_near_wires_mm3(case: FlowCase, size_mm: float, finest_mm: float) -> float:
-    """Estimate the volume of what is refined around wires on a grid with this spacing."""
+    """Estimate the volume of what is refined around wires or a neck on a grid with this spacing."""
     reach_mm = _reach_mm(case, size_mm, finest_mm) + 1.2 * RIM * size_mm
-    step_mm, corners_mm = reach_mm / 4, _walls(case).corners_mm
+    step_mm, corners_mm = reach_mm / 4, _around(case).corners_mm
     low_mm = corners_mm.min(axis=(0, 1)) - reach_mm - 2 * step_mm
     at = np.rint((corners_mm.mean(axis=1) - low_mm) / step_mm).astype(int)
     is_blood = np.ones(at.max(axis=0) + 7, dtype=bool)

@@ -1,10 +1,10 @@
 """Build a lattice-Boltzmann run and advance it from check to check."""
 
 from collections import deque
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from time import perf_counter
-from typing import Final
+from typing import Any, Final
 from weakref import WeakKeyDictionary
 
 import numba
@@ -52,7 +52,7 @@ LEARNED: Final = 2
 """Number of harmonics of a pulse for which the delay of an outlet is corrected: cycles that correct more converge
 slowly."""
 
-_GRIDS: WeakKeyDictionary[Vessel, dict[Hashable, list[tuple[Grid, Interface | None]]]] = WeakKeyDictionary()
+_GRIDS: WeakKeyDictionary[Vessel, dict[tuple[Any, ...], list[tuple[Grid, Interface | None]]]] = WeakKeyDictionary()
 """Grids by grid spacing, refined part and resolved wires, as long as the vessel exists."""
 
 
@@ -146,11 +146,13 @@ def _grids(case: FlowCase, cell_size_mm: float) -> list[tuple[Grid, Interface | 
     Flows in the same vessel with the same walls share them.
     """
     built = _GRIDS.setdefault(case.vessel, {})
-    sizes, numerics = sizes_mm(case, cell_size_mm), case.numerics
+    sizes = sizes_mm(case, cell_size_mm)
     coarsest_mm, finest_mm = sizes[0], sizes[-1]
     are_walls = domains.wires_of(case, finest_mm) is not None
-    key = sizes, case.sac if numerics.close_up else None, case.solids if are_walls else ()
+    key = sizes, case.sac if len(sizes) > 1 else None, case.solids if are_walls else ()
     if key not in built:
+        for of_walls in [other for other in built if other[2]]:  # of another device, or of another tile of it
+            del built[of_walls]
         domain = domains.build(case.vessel, coarsest_mm, wires=domains.wires_of(case, coarsest_mm))
         limit = thickest(case, domain)
         grids: list[tuple[Grid, Interface | None]] = [(Grid(domain, limit, address(domain, limit)), None)]
