@@ -10,12 +10,12 @@ from vstent import phantoms
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
-from vstent.deployment.struts import is_over_restored
+from vstent.deployment.struts import is_over_restored, part_of
 from vstent.flow import simulation
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.indices import indices, neck_diameter_mm
-from vstent.flow.lattice import calibration
+from vstent.flow.lattice import calibration, stepping
 from vstent.flow.lattice.cost import estimate
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.levels import sizes_mm
@@ -136,6 +136,19 @@ def test_the_finer_level_contains_the_screen(braided: FlowCase) -> None:
         level.screen.entry[:, 3].sum() * level.domain.cell_size_mm**3 / level.scales.step_s for level in (coarse, fine)
     )
     assert next(resistance) == pytest.approx(next(resistance), rel=0.05)
+
+
+def test_every_device_has_its_own_finer_level_and_the_last_two_are_kept(braided: FlowCase) -> None:
+    case = with_numerics(braided, cells_per_diameter=12.0, cells_across_neck=20.0)
+    (stent,), size_mm = case.solids, default_cell_size_mm(case)
+    across_mm = stent.wire_points_mm[:, 2] - np.median(stent.wire_points_mm[:, 2])
+    for chosen in (across_mm < 0, across_mm > 0, across_mm != 0):
+        part = replace(case, solids=(part_of(stent, chosen),))
+        anew = replace(part, vessel=replace(part.vessel))
+        shared, own = (stepping._grids(one, size_mm)[-1][0].domain for one in (part, anew))
+        np.testing.assert_array_equal(shared.centers_mm, own.centers_mm)
+        assert stepping._grids(part, size_mm)[-1][0].domain is shared
+    assert sum(bool(key[2]) for key in stepping._GRIDS[case.vessel]) == 2
 
 
 @pytest.mark.validation

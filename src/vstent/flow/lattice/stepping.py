@@ -27,6 +27,7 @@ from vstent.flow.lattice.levels import (
     WIDTH,
     Interface,
     Stencil,
+    around_wires_mm,
     beside_walls,
     refined,
     sizes_mm,
@@ -52,8 +53,9 @@ LEARNED: Final = 2
 """Number of harmonics of a pulse for which the delay of an outlet is corrected: cycles that correct more converge
 slowly."""
 
-_GRIDS: WeakKeyDictionary[Vessel, dict[Hashable, list[tuple[Grid, Interface | None]]]] = WeakKeyDictionary()
-"""Grids by grid spacing, refined part and resolved wires, as long as the vessel exists."""
+_GRIDS: WeakKeyDictionary[Vessel, dict[tuple[Hashable, ...], list[tuple[Grid, Interface | None]]]] = WeakKeyDictionary()
+"""Grids by grid spacings, refined part, wires around which they are refined, and whether these are walls, as long as
+the vessel exists."""
 
 
 def build(
@@ -143,22 +145,27 @@ def prepare(case: FlowCase, cell_size_mm: float) -> None:
 def _grids(case: FlowCase, cell_size_mm: float) -> list[tuple[Grid, Interface | None]]:
     """Return the grids of a case, coarse to fine, each with its coupling to the next coarser one.
 
-    Flows in the same vessel with the same walls share them.
+    Flows in the same vessel with the same walls share them. Of those that depend on wires the last two are kept.
     """
     built = _GRIDS.setdefault(case.vessel, {})
     sizes, numerics = sizes_mm(case, cell_size_mm), case.numerics
     coarsest_mm, finest_mm = sizes[0], sizes[-1]
     are_walls = domains.wires_of(case, finest_mm) is not None
-    key = sizes, case.sac if numerics.close_up else None, case.solids if are_walls else ()
-    if key not in built:
+    are_own = are_walls or coarsest_mm > around_wires_mm(case)
+    key = sizes, case.sac if numerics.close_up else None, case.solids if are_own else (), are_walls
+    found = built.pop(key, None)
+    if found is None:
         domain = domains.build(case.vessel, coarsest_mm, wires=domains.wires_of(case, coarsest_mm))
         limit = thickest(case, domain)
         grids: list[tuple[Grid, Interface | None]] = [(Grid(domain, limit, address(domain, limit)), None)]
         while len(grids) < len(sizes):
             coarse, fine, between = refined(case, grids[-1][0], finest_mm)
             grids[-1:] = (coarse, grids[-1][1]), (fine, between)
-        built[key] = grids
-    return [(grid, between and between.anew()) for grid, between in built[key]]
+        found = grids
+        for old in [one for one in built if one[2]][:-1]:
+            built.pop(old, None)
+    built[key] = found
+    return [(grid, between and between.anew()) for grid, between in found]
 
 
 def place_screen(state: State, case: FlowCase) -> None:
