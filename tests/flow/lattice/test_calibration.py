@@ -151,6 +151,18 @@ def test_every_device_has_its_own_finer_level_and_the_last_two_are_kept(braided:
     assert sum(bool(key[2]) for key in stepping._GRIDS[case.vessel]) == 2
 
 
+def test_a_device_apart_from_the_neck_has_a_flow_and_says_that_it_is_not_calibrated(braided: FlowCase) -> None:
+    """Its wires are farther from the sac than those that finer levels are wanted for."""
+    away_mm = np.array([1.2, 0.0, 0.0])
+    media = tuple(replace(one, points_mm=one.points_mm - away_mm) for one in braided.media)
+    solids = tuple(replace(one, wire_points_mm=one.wire_points_mm - away_mm) for one in braided.solids)
+    away = with_numerics(replace(braided, media=media, solids=solids), cells_per_diameter=8.0, cells_across_neck=10.0)
+    assert not calibration.suits(away)
+    assert estimate(away).cells > 0
+    field = simulate_case(with_numerics(away, wires="calibrated", max_steps=100))
+    assert "The screen is not calibrated: no wires over the neck" in field.advice
+
+
 @pytest.mark.validation
 def test_a_narrow_neck_on_a_finer_level_is_that_of_the_fine_grid(braided: FlowCase) -> None:
     """Neck inflow and sac velocity within 4 %; on the wider grid alone they are a sixth too high."""

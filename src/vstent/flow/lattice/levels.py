@@ -214,12 +214,12 @@ def _reach_mm(case: FlowCase, size_mm: float, finest_mm: float) -> float:
 
 
 def _walls(case: FlowCase) -> Surface:
-    """Return the part of the wires that finer levels take as walls: all in the sac and near its neck."""
+    """Return the wires around which grids are refined: all in the sac and near its neck, or simply all if none are."""
     assert case.wires is not None
     if case.sac is None:
         return case.wires
     is_near = case.sac.signed_distance(case.wires.corners_mm.mean(axis=1)) < BESIDE_NECK * thickness_mm(case.wires)
-    return Surface(case.wires.vertices_mm, case.wires.faces[is_near])
+    return Surface(case.wires.vertices_mm, case.wires.faces[is_near]) if is_near.any() else case.wires
 
 
 def beside_walls(case: FlowCase, blood_mm: Floats) -> FlowCase:
