@@ -290,7 +290,8 @@ class _Runs:
         case, runs = _with_wires(case, "screen"), calibration.ROUNDS + 1
         if not calibration.suits(case):
             field = self.answer(case, start)
-            return replace(field, advice=f"{field.advice} The screen is not calibrated, because pores are too wide.")
+            why = " The screen is not calibrated: no wires over the neck, wires 0.4 mm apart or more, or coils."
+            return replace(field, advice=field.advice + why) if case.media else field
         similar, factor, size_mm = self.similar, 1.0, default_cell_size_mm(case)
         rounds: list[tuple[float, float, float]] = []
         for number in range(runs - 1):
@@ -302,7 +303,10 @@ class _Runs:
             factor = calibration.next_factor(rounds)
         last = replace(self, progress=self._part(1 - 1 / runs, 1.0), similar=similar)
         field = last.answer(calibration.scaled(case, factor), start)
-        return replace(field, advice=f"{field.advice} The screen is calibrated: it resists {factor:.3g} times as much.")
+        remark = f"calibrated: it resists {factor:.3g} times as much."
+        if all(of_screen == of_walls for _, of_screen, of_walls in rounds):
+            remark = "not calibrated: the force on its wires is not proportional to the flow through them."
+        return replace(field, advice=f"{field.advice} The screen is {remark}")
 
     def _bare(self, name: str, case: FlowCase, size_mm: float, finer: Guess, part: Part) -> FlowField | None:
         """Return the flow without a device on a coarse grid, from a finer one and computed only once; None without."""

@@ -163,6 +163,23 @@ def test_a_device_apart_from_the_neck_has_a_flow_and_says_that_it_is_not_calibra
     assert "The screen is not calibrated: no wires over the neck" in field.advice
 
 
+def test_a_flow_without_a_screen_says_nothing_of_calibrating_it(braided: FlowCase) -> None:
+    bare = with_numerics(replace(braided, media=(), solids=()), cells_per_diameter=8.0, max_steps=100)
+    assert "calibrated" not in simulate_case(with_numerics(bare, wires="calibrated")).advice
+
+
+def test_a_screen_whose_resistance_cannot_be_read_off_stays(braided: FlowCase, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a tile that diverged, force and velocity are nan."""
+    case = with_numerics(braided, cells_per_diameter=8.0, cells_across_neck=0.0, max_steps=100)
+    screen = simulate_case(case)
+    for found_there in ((1.0, 0.5), (np.nan, np.nan)):
+        monkeypatch.setattr(calibration, "_resistance", lambda *_, found_there=found_there: found_there)
+        rounds = [(1.0, *calibration.read_off(case, screen, default_cell_size_mm(case)))]
+        assert calibration.next_factor(rounds) == 1.0
+        assert calibration.next_factor([(0.8, 2.0, 1.5), (0.9, *rounds[0][1:])]) == 0.9
+    assert "The screen is not calibrated: the force" in simulate_case(with_numerics(case, wires="calibrated")).advice
+
+
 @pytest.mark.validation
 def test_a_narrow_neck_on_a_finer_level_is_that_of_the_fine_grid(braided: FlowCase) -> None:
     """Neck inflow and sac velocity within 4 %; on the wider grid alone they are a sixth too high."""

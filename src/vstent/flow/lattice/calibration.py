@@ -57,7 +57,7 @@ LIKE_FLOW: Final = 0.9
 
 def suits(case: FlowCase) -> bool:
     """Return whether the screen of a case can be calibrated: wires over a neck, with pores small against a tile."""
-    if case.wires is None or case.ostium is None or not case.media:
+    if case.wires is None or case.ostium is None or not case.media or not len(_samples(case)[0]):
         return False
     return all(one.normals.any() and np.median(one.spacing_mm) < WIDEST_PORES_MM for one in case.media)
 
@@ -65,12 +65,12 @@ def suits(case: FlowCase) -> bool:
 def read_off(case: FlowCase, flow: FlowField, cell_size_mm: float) -> tuple[float, float]:
     """Return what the screen and the wires of a steady case resist to the blood in a flow, up to a common constant.
 
-    Both are equal where force and velocity are no measure of a resistance (see `LIKE_FLOW`).
+    Both are 1 where force and velocity are no measure of a resistance (see `LIKE_FLOW`).
     """
     center_mm = _strongest_mm(case, flow)
     of_screen, _ = _resistance(case, flow, cell_size_mm, center_mm)
     of_walls, likeness = _resistance(tile(case, center_mm), flow, cell_size_mm, center_mm)
-    return of_screen, of_walls if likeness > LIKE_FLOW and of_walls > 0 else of_screen
+    return (of_screen, of_walls) if likeness > LIKE_FLOW and min(of_screen, of_walls) > 0 else (1.0, 1.0)
 
 
 def next_factor(rounds: Sequence[tuple[float, float, float]]) -> float:
