@@ -147,8 +147,9 @@ def _decided(case: FlowCase) -> tuple[FlowCase, str]:
     if USUAL_PART * cost.seconds < QUICK_S and cost.memory_bytes < free_memory_bytes():
         return _with_wires(case, "resolved"), ""
     if calibration.suits(case):
-        seconds = calibration.seconds(case) + calibration.ROUNDS * USUAL_PART * estimate(screen).seconds
-        if seconds < QUICK_S:
+        of_tiles_s, of_tile_bytes = calibration.cost(case)
+        seconds = of_tiles_s + calibration.ROUNDS * USUAL_PART * estimate(screen).seconds
+        if seconds < QUICK_S and of_tile_bytes < free_memory_bytes():
             return _with_wires(case, "calibrated"), f" The wires are a calibrated screen: {how}"
         how += f" Calibrating them would take about {duration(seconds)}."
     return screen, f" The wires are a screen: {how}"
@@ -167,13 +168,33 @@ def _resisted(case: FlowCase, bare: FlowField | None) -> FlowCase:
 
 def foretell_cost(case: FlowCase) -> str:
     """Return a sentence on the expected run time and memory of a flow; one that does not fit is refused."""
+    from vstent.flow.lattice import calibration
+
     case, remark = _decided(case)
-    return _engine_of(case)(default_cell_size_mm(case)).cost(case) + remark
+    sentence = _engine_of(case)(default_cell_size_mm(case)).cost(case)
+    if _is_calibrated(case):
+        of_tiles_s, of_tile_bytes = calibration.cost(case)
+        sentence += (
+            f" Calibrating the screen takes {calibration.ROUNDS} more such flows, {duration(of_tiles_s)} for wires as "
+            f"walls in pieces of the neck, and {of_tile_bytes / 1e9:.2g} GB."
+        )
+    return sentence + remark
 
 
 def memory_bytes(case: FlowCase) -> float | None:
     """Return the expected peak memory of a flow; None where its engine does not estimate it."""
-    return _engine_of(case)(default_cell_size_mm(case)).memory_bytes(case)
+    from vstent.flow.lattice import calibration
+
+    case, _ = _decided(case)
+    own = _engine_of(case)(default_cell_size_mm(case)).memory_bytes(case)
+    return max(own or 0.0, calibration.cost(case)[1]) if _is_calibrated(case) else own
+
+
+def _is_calibrated(case: FlowCase) -> bool:
+    """Return whether the screen of a case is calibrated."""
+    from vstent.flow.lattice import calibration
+
+    return case.numerics.wires == "calibrated" and _engine_of(case).has_levels and calibration.suits(case)
 
 
 def engine_class(numerics: Numerics, *, is_pulsatile: bool) -> type[AbstractEngine[Any]]:

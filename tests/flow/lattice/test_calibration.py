@@ -24,6 +24,7 @@ from vstent.flow.settings import FlowSettings, Numerics
 from vstent.flow.simulation import simulate_case
 from vstent.geometry.vessel import Vessel
 from vstent.kernels.arrays import Floats
+from vstent.units import duration
 
 CELL_MM = 0.2
 INDICES = ("neck_inflow_mL_s", "mean_sac_velocity_m_s", "mean_sac_wss_Pa")
@@ -83,7 +84,7 @@ def test_a_tile_has_the_walls_near_a_point_and_the_screen_elsewhere(braided: Flo
     assert case.wires is not None
     of_whole = np.linalg.norm(case.wires.corners_mm.mean(axis=1) - center_mm, axis=1) < calibration.TILE_MM - 0.1
     assert len(away_mm) > of_whole.sum()
-    assert calibration.seconds(case) > 0
+    assert min(calibration.cost(case)) > 0
 
 
 def test_a_screen_with_wide_pores_is_left_and_it_is_told(braided: FlowCase) -> None:
@@ -100,7 +101,7 @@ def test_wires_too_many_for_walls_are_calibrated_where_that_is_quick(
 ) -> None:
     is_open = with_numerics(braided, cell_size_mm=CELL_MM, wires="auto")
     screen, walls = (estimate(with_numerics(is_open, wires=wires)).seconds for wires in ("screen", "resolved"))
-    calibrating = calibration.seconds(is_open) + calibration.ROUNDS * simulation.USUAL_PART * screen
+    calibrating = calibration.cost(is_open)[0] + calibration.ROUNDS * simulation.USUAL_PART * screen
     assert calibrating < simulation.USUAL_PART * walls
     for allowed, chosen in (
         (simulation.USUAL_PART * walls + 1.0, "resolved"),
@@ -111,6 +112,9 @@ def test_wires_too_many_for_walls_are_calibrated_where_that_is_quick(
         case, reason = simulation._decided(is_open)
         assert case.numerics.wires == chosen
         assert ("Calibrating them would take" in reason) == (chosen == "screen")
+    monkeypatch.setattr(simulation, "QUICK_S", calibrating + 1.0)
+    monkeypatch.setattr(simulation, "free_memory_bytes", lambda: 0.99 * calibration.cost(is_open)[1])
+    assert simulation._decided(is_open)[0].numerics.wires == "screen"
 
 
 def test_a_narrow_neck_with_a_screen_has_a_finer_level_unless_the_spacing_is_given(braided: FlowCase) -> None:
@@ -161,6 +165,19 @@ def test_a_device_apart_from_the_neck_has_a_flow_and_says_that_it_is_not_calibra
     assert estimate(away).cells > 0
     field = simulate_case(with_numerics(away, wires="calibrated", max_steps=100))
     assert "The screen is not calibrated: no wires over the neck" in field.advice
+
+
+def test_the_cost_of_a_calibrated_flow_contains_its_tiles(braided: FlowCase) -> None:
+    """The walls of a tile need more memory than the flow; where it is not free, the program does not choose them."""
+    case = with_numerics(braided, cells_per_diameter=12.0, wires="calibrated")
+    seconds, memory_bytes = calibration.cost(case)
+    assert simulation.memory_bytes(case) == memory_bytes > 1.2 * estimate(case).memory_bytes
+    said = simulation.foretell_cost(case)
+    assert said.startswith(str(estimate(case)))
+    assert f"takes 2 more such flows, {duration(seconds)} for wires" in said
+    assert f"and {memory_bytes / 1e9:.2g} GB." in said
+    bare = replace(case, media=(), solids=())
+    assert simulation.foretell_cost(bare) == str(estimate(bare))
 
 
 def test_a_flow_without_a_screen_says_nothing_of_calibrating_it(braided: FlowCase) -> None:

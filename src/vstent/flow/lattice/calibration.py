@@ -21,7 +21,7 @@ from vstent.flow import sampling
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.lattice import stepping
-from vstent.flow.lattice.cost import seconds_of
+from vstent.flow.lattice.cost import memory_bytes, seconds_of
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.levels import sizes_mm
 from vstent.flow.lattice.pace import longest_step_s, peak_speed_m_s
@@ -89,13 +89,13 @@ def scaled(case: FlowCase, factor: float) -> FlowCase:
     return replace(case, media=tuple(media))
 
 
-def seconds(case: FlowCase) -> float:
-    """Estimate the run time of all tiles of a case."""
+def cost(case: FlowCase) -> tuple[float, float]:
+    """Estimate the run time, s, of all tiles of a case, and the peak memory, bytes, of one."""
     assert case.ostium is not None
     walls, size_mm = tile(case, case.ostium.vertices_mm.mean(axis=0)), default_cell_size_mm(case)
     sizes = sizes_mm(walls, size_mm)
     step_s = longest_step_s(case, sizes[-1], peak_speed_m_s(case, None))
-    return ROUNDS * seconds_of(walls, size_mm, settling_s(case) / step_s)
+    return ROUNDS * seconds_of(walls, size_mm, settling_s(case) / step_s), memory_bytes(walls)
 
 
 def tile(case: FlowCase, center_mm: Floats) -> FlowCase:
