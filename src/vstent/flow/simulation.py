@@ -270,7 +270,7 @@ class _Runs:
     similar: FlowField | None = None
     """Flow with a similar stent, from which the whole vessel starts."""
     prefix: str = ""
-    """Begin of the names of runs, which tells those before a calibration from the last one."""
+    """Begin of the names of runs, which differ from those with the screen as it is where it is calibrated."""
 
     def answer(self, case: FlowCase, start: FlowField | None) -> FlowField:
         """Compute a flow from a first guess on coarser grids, each of which starts from the next coarser one.
@@ -322,7 +322,7 @@ class _Runs:
             similar = now.answer(steady, start)
             rounds.append((factor, *calibration.read_off(steady, similar, size_mm)))
             factor = calibration.next_factor(rounds)
-        last = replace(self, progress=self._part(1 - 1 / runs, 1.0), similar=similar)
+        last = replace(self, prefix="calibrated ", progress=self._part(1 - 1 / runs, 1.0), similar=similar)
         field = last.answer(calibration.scaled(case, factor), start)
         remark = f"calibrated: it resists {factor:.3g} times as much."
         if all(of_screen == of_walls for _, of_screen, of_walls in rounds):

@@ -197,6 +197,28 @@ def test_a_screen_whose_resistance_cannot_be_read_off_stays(braided: FlowCase, m
     assert "The screen is not calibrated: the force" in simulate_case(with_numerics(case, wires="calibrated")).advice
 
 
+def test_the_runs_of_a_calibrated_flow_are_stored_apart_from_those_with_the_screen_as_it_is(
+    braided: FlowCase, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was stored of one must not be continued as the other, where `auto` decides otherwise the next time."""
+
+    class Names(list[str]):
+        def load(self, run: str) -> None:
+            self.append(run)
+
+        def save(self, run: str, saved: object) -> None: ...
+
+    case = with_numerics(braided, cells_per_diameter=8.0, cells_across_neck=0.0, max_steps=100)
+    monkeypatch.setattr(calibration, "_resistance", lambda *_: (1.0, 0.5))
+    of_flows = [Names(), Names()]
+    for wires, names in zip(("screen", "calibrated"), of_flows, strict=True):
+        simulate_case(with_numerics(case, wires=wires), checkpoint=names)
+    assert of_flows[0][-1] == "answer"
+    assert [name for name in of_flows[1] if "answer" in name] == [
+        f"{name} answer" for name in ("round 0", "round 1", "calibrated")
+    ]
+
+
 @pytest.mark.validation
 def test_a_narrow_neck_on_a_finer_level_is_that_of_the_fine_grid(braided: FlowCase) -> None:
     """Neck inflow and sac velocity within 4 %; on the wider grid alone they are a sixth too high."""
