@@ -10,7 +10,7 @@ from vstent import phantoms
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
-from vstent.deployment.struts import is_over_restored
+from vstent.deployment.struts import is_over_restored, part_of
 from vstent.flow import simulation
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.domain import default_cell_size_mm
@@ -24,6 +24,7 @@ from vstent.flow.settings import FlowSettings, Numerics
 from vstent.flow.simulation import simulate_case
 from vstent.geometry.vessel import Vessel
 from vstent.kernels.arrays import Floats
+from vstent.units import duration
 
 CELL_MM = 0.2
 INDICES = ("neck_inflow_mL_s", "mean_sac_velocity_m_s", "mean_sac_wss_Pa")
@@ -83,7 +84,7 @@ def test_a_tile_has_the_walls_near_a_point_and_the_screen_elsewhere(braided: Flo
     assert case.wires is not None
     of_whole = np.linalg.norm(case.wires.corners_mm.mean(axis=1) - center_mm, axis=1) < calibration.TILE_MM - 0.1
     assert len(away_mm) > of_whole.sum()
-    assert calibration.seconds(case) > 0
+    assert min(calibration.cost(case)) > 0
 
 
 def test_a_screen_with_wide_pores_is_left_and_it_is_told(braided: FlowCase) -> None:
@@ -100,7 +101,7 @@ def test_wires_too_many_for_walls_are_calibrated_where_that_is_quick(
 ) -> None:
     is_open = with_numerics(braided, cell_size_mm=CELL_MM, wires="auto")
     screen, walls = (estimate(with_numerics(is_open, wires=wires)).seconds for wires in ("screen", "resolved"))
-    calibrating = calibration.seconds(is_open) + calibration.ROUNDS * simulation.USUAL_PART * screen
+    calibrating = calibration.cost(is_open)[0] + calibration.ROUNDS * simulation.USUAL_PART * screen
     assert calibrating < simulation.USUAL_PART * walls
     for allowed, chosen in (
         (simulation.USUAL_PART * walls + 1.0, "resolved"),
@@ -111,6 +112,9 @@ def test_wires_too_many_for_walls_are_calibrated_where_that_is_quick(
         case, reason = simulation._decided(is_open)
         assert case.numerics.wires == chosen
         assert ("Calibrating them would take" in reason) == (chosen == "screen")
+    monkeypatch.setattr(simulation, "QUICK_S", calibrating + 1.0)
+    monkeypatch.setattr(simulation, "free_memory_bytes", lambda: 0.99 * calibration.cost(is_open)[1])
+    assert simulation._decided(is_open)[0].numerics.wires == "screen"
 
 
 def test_a_narrow_neck_with_a_screen_has_a_finer_level_unless_the_spacing_is_given(braided: FlowCase) -> None:
@@ -148,6 +152,71 @@ def test_the_finer_level_contains_the_screen(braided: FlowCase) -> None:
         level.screen.entry[:, 3].sum() * level.domain.cell_size_mm**3 / level.scales.step_s for level in (coarse, fine)
     )
     assert next(resistance) == pytest.approx(next(resistance), rel=0.05)
+
+
+def test_a_device_apart_from_the_neck_has_a_flow_and_says_that_it_is_not_calibrated(braided: FlowCase) -> None:
+    """Its wires are farther from the sac than those that finer levels are wanted for."""
+    away_mm = np.array([1.2, 0.0, 0.0])
+    media = tuple(replace(one, points_mm=one.points_mm - away_mm) for one in braided.media)
+    solids = tuple(replace(one, wire_points_mm=one.wire_points_mm - away_mm) for one in braided.solids)
+    away = with_numerics(replace(braided, media=media, solids=solids), cells_per_diameter=8.0, cells_across_neck=10.0)
+    assert not calibration.suits(away)
+    assert estimate(away).cells > 0
+    field = simulate_case(with_numerics(away, wires="calibrated", max_steps=100))
+    assert "The screen is not calibrated: no wires over the neck" in field.advice
+
+
+def test_the_cost_of_a_calibrated_flow_contains_its_tiles(braided: FlowCase) -> None:
+    """The walls of a tile need more memory than the flow; where it is not free, the program does not choose them."""
+    case = with_numerics(braided, cells_per_diameter=12.0, wires="calibrated")
+    seconds, memory_bytes = calibration.cost(case)
+    assert simulation.memory_bytes(case) == memory_bytes > 1.2 * estimate(case).memory_bytes
+    said = simulation.foretell_cost(case)
+    assert said.startswith(str(estimate(case)))
+    assert f"takes 2 more such flows, {duration(seconds)} for wires" in said
+    assert f"and {memory_bytes / 1e9:.2g} GB." in said
+    bare = replace(case, media=(), solids=())
+    assert simulation.foretell_cost(bare) == str(estimate(bare))
+
+
+def test_a_flow_without_a_screen_says_nothing_of_calibrating_it(braided: FlowCase) -> None:
+    bare = with_numerics(replace(braided, media=(), solids=()), cells_per_diameter=8.0, max_steps=100)
+    assert "calibrated" not in simulate_case(with_numerics(bare, wires="calibrated")).advice
+
+
+def test_a_screen_whose_resistance_cannot_be_read_off_stays(braided: FlowCase, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a tile that diverged, force and velocity are nan."""
+    case = with_numerics(braided, cells_per_diameter=8.0, cells_across_neck=0.0, max_steps=100)
+    screen = simulate_case(case)
+    tile = calibration.strongest(case, screen)
+    for found_there in ((1.0, 0.5), (np.nan, np.nan)):
+        monkeypatch.setattr(calibration, "_resistance", lambda *_, found_there=found_there: found_there)
+        rounds = [(1.0, *calibration.read_off(case, tile, screen, default_cell_size_mm(case)))]
+        assert calibration.next_factor(rounds) == 1.0
+        assert calibration.next_factor([(0.8, 2.0, 1.5), (0.9, *rounds[0][1:])]) == 0.9
+    assert "The screen is not calibrated: the force" in simulate_case(with_numerics(case, wires="calibrated")).advice
+
+
+def test_the_runs_of_a_calibrated_flow_are_stored_apart_from_those_with_the_screen_as_it_is(
+    braided: FlowCase, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was stored of one must not be continued as the other, where `auto` decides otherwise the next time."""
+
+    class Names(list[str]):
+        def load(self, run: str) -> None:
+            self.append(run)
+
+        def save(self, run: str, saved: object) -> None: ...
+
+    case = with_numerics(braided, cells_per_diameter=8.0, cells_across_neck=0.0, max_steps=100)
+    monkeypatch.setattr(calibration, "_resistance", lambda *_: (1.0, 0.5))
+    of_flows = [Names(), Names()]
+    for wires, names in zip(("screen", "calibrated"), of_flows, strict=True):
+        simulate_case(with_numerics(case, wires=wires), checkpoint=names)
+    assert of_flows[0][-1] == "answer"
+    assert [name for name in of_flows[1] if "answer" in name] == [
+        f"{name} answer" for name in ("round 0", "round 1", "calibrated")
+    ]
 
 
 @pytest.mark.validation

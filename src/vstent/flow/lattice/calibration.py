@@ -22,7 +22,7 @@ from vstent.flow import sampling
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.lattice import stepping
-from vstent.flow.lattice.cost import seconds_of
+from vstent.flow.lattice.cost import memory_bytes, seconds_of
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.levels import sizes_mm
 from vstent.flow.lattice.pace import longest_step_s, peak_speed_m_s
@@ -58,7 +58,7 @@ LIKE_FLOW: Final = 0.9
 
 def suits(case: FlowCase) -> bool:
     """Return whether the screen of a case can be calibrated: wires over a neck, with pores small against a tile."""
-    if case.wires is None or case.ostium is None or not case.media:
+    if case.wires is None or case.ostium is None or not case.media or not len(_samples(case)[0]):
         return False
     return all(one.normals.any() and np.median(one.spacing_mm) < WIDEST_PORES_MM for one in case.media)
 
@@ -95,11 +95,11 @@ def strongest(case: FlowCase, flow: FlowField) -> Tile:
 def read_off(case: FlowCase, tile: Tile, flow: FlowField, cell_size_mm: float) -> tuple[float, float]:
     """Return what the screen of a steady case and the wires of a tile resist to a flow, up to a common constant.
 
-    Both are equal where force and velocity are no measure of a resistance (see `LIKE_FLOW`).
+    Both are 1 where force and velocity are no measure of a resistance (see `LIKE_FLOW`).
     """
     of_screen, _ = _resistance(case, flow, cell_size_mm, tile.center_mm)
     of_walls, likeness = _resistance(tile.walls(case), flow, cell_size_mm, tile.center_mm)
-    return of_screen, of_walls if likeness > LIKE_FLOW and of_walls > 0 else of_screen
+    return (of_screen, of_walls) if likeness > LIKE_FLOW and min(of_screen, of_walls) > 0 else (1.0, 1.0)
 
 
 def next_factor(rounds: Sequence[tuple[float, float, float]]) -> float:
@@ -118,12 +118,12 @@ def scaled(case: FlowCase, factor: float) -> FlowCase:
     return replace(case, media=tuple(media))
 
 
-def seconds(case: FlowCase) -> float:
-    """Estimate the run time of all tiles of a case."""
+def cost(case: FlowCase) -> tuple[float, float]:
+    """Estimate the run time, s, of all tiles of a case, and the peak memory, bytes, of one."""
     assert case.ostium is not None
     walls, size_mm = tile_at(case, case.ostium.vertices_mm.mean(axis=0)).walls(case), default_cell_size_mm(case)
     step_s = longest_step_s(case, sizes_mm(walls, size_mm)[-1], peak_speed_m_s(case, None))
-    return ROUNDS * seconds_of(walls, size_mm, settling_s(case) / step_s)
+    return ROUNDS * seconds_of(walls, size_mm, settling_s(case) / step_s), memory_bytes(walls)
 
 
 def settling_s(case: FlowCase) -> float:

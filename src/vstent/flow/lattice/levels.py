@@ -218,9 +218,10 @@ def _reach_mm(case: FlowCase, size_mm: float, finest_mm: float) -> float:
 
 
 def _around(case: FlowCase) -> Surface:
-    """Return what finer levels lie around: wires that are walls, in the sac and near its neck, or a neck with a screen.
+    """Return what finer levels lie around: a neck with a screen, or wires that are walls.
 
-    The latter is the same for all devices in a vessel, which share the grids.
+    Walls are the wires in the sac and near its neck, or simply all if none are. The neck is the same for all devices in
+    a vessel, which share the grids.
     """
     assert case.wires is not None
     if case.numerics.wires != "resolved":
@@ -229,7 +230,7 @@ def _around(case: FlowCase) -> Surface:
     if case.sac is None:
         return case.wires
     is_near = case.sac.signed_distance(case.wires.corners_mm.mean(axis=1)) < BESIDE_NECK * thickness_mm(case.wires)
-    return Surface(case.wires.vertices_mm, case.wires.faces[is_near])
+    return Surface(case.wires.vertices_mm, case.wires.faces[is_near]) if is_near.any() else case.wires
 
 
 def beside_walls(case: FlowCase, blood_mm: Floats) -> FlowCase:

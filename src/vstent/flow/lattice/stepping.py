@@ -146,7 +146,7 @@ def prepare(case: FlowCase, cell_size_mm: float) -> None:
 def _grids(case: FlowCase, cell_size_mm: float) -> list[tuple[Grid, Interface | None]]:
     """Return the grids of a case, coarse to fine, each with its coupling to the next coarser one.
 
-    Flows in the same vessel with the same walls share them.
+    Flows in the same vessel with the same walls share them. Of those with walls the last is kept.
     """
     built = _GRIDS.setdefault(case.vessel, {})
     sizes = sizes_mm(case, cell_size_mm)
