@@ -10,7 +10,7 @@ from vstent import phantoms
 from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
-from vstent.deployment.struts import is_over_restored, part_of
+from vstent.deployment.struts import is_over_restored
 from vstent.flow import simulation
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.domain import default_cell_size_mm
