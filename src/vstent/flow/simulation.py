@@ -318,8 +318,8 @@ class _Runs:
         for number in range(runs - 1):
             steady = replace(calibration.scaled(case, factor), waveform=None)
             progress = self._part(number / runs, (number + 1) / runs)
-            now = replace(self, prefix=f"round {number} ", progress=progress, similar=similar)
-            similar = now.answer(steady, start)
+            now = replace(self, engine=_engine_of(steady), prefix=f"round {number} ", progress=progress)
+            similar = replace(now, similar=similar).answer(steady, start)
             rounds.append((factor, *calibration.read_off(steady, similar, size_mm)))
             factor = calibration.next_factor(rounds)
         last = replace(self, prefix="calibrated ", progress=self._part(1 - 1 / runs, 1.0), similar=similar)
