@@ -17,8 +17,9 @@ from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.indices import indices, neck_diameter_mm
 from vstent.flow.lattice import calibration, stepping
 from vstent.flow.lattice.cost import estimate
-from vstent.flow.lattice.engine import LatticeBoltzmann
+from vstent.flow.lattice.engine import LatticeBoltzmann, PulsatileLatticeBoltzmann
 from vstent.flow.lattice.levels import sizes_mm
+from vstent.flow.lattice.state import State
 from vstent.flow.problem import flow_case
 from vstent.flow.settings import FlowSettings, Numerics
 from vstent.flow.simulation import simulate_case
@@ -226,7 +227,16 @@ def test_the_screen_of_a_pulsatile_flow_is_calibrated_in_steady_ones(
     of_wires = {"screen": (1.0, 1.0), "resolved": (0.9, 1.0)}
     monkeypatch.setattr(calibration, "_resistance", lambda case, *_: of_wires[case.numerics.wires])
     case = with_numerics(braided, cells_per_diameter=8.0, cells_across_neck=0.0, max_steps=100, max_cycles=1)
-    field = simulate_case(with_numerics(replace(case, waveform=Waveform(0.1, (0.1,), (0.0,))), wires="calibrated"))
+    pulse, begun = with_numerics(replace(case, waveform=Waveform(0.1, (0.1,), (0.0,))), wires="calibrated"), []
+    bare, init = simulate_case(replace(pulse, media=(), solids=())), PulsatileLatticeBoltzmann.init
+
+    def watched(engine: PulsatileLatticeBoltzmann, case: FlowCase, start: FlowField) -> State:
+        begun.append(len(start.phases))
+        return init(engine, case, start)
+
+    monkeypatch.setattr(PulsatileLatticeBoltzmann, "init", watched)
+    field = simulate_case(pulse, start=bare)
+    assert begun[-1] > 0, "a pulse that begins with a steady flow needs more cycles"
     assert len(field.phases) == PHASES
     factor = calibration.next_factor([(1.0, 1.0, 0.9)])
     factor = calibration.next_factor([(1.0, 1.0, 0.9), (factor, 1.0, 0.9)])
