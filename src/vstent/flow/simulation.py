@@ -319,12 +319,14 @@ class _Runs:
         for number in range(runs - 1):
             steady = replace(calibration.scaled(case, factor), waveform=None)
             progress = self._part(number / runs, (number + 1) / runs)
-            now = replace(self, prefix=f"round {number} ", progress=progress, similar=similar)
-            similar = now.answer(steady, start)
+            now = replace(self, engine=_engine_of(steady), prefix=f"round {number} ", progress=progress)
+            similar = replace(now, similar=similar).answer(steady, start)
             tile = tile or calibration.strongest(steady, similar)
             rounds.append((factor, *calibration.read_off(steady, tile, similar, size_mm)))
             factor = calibration.next_factor(rounds)
-        last = replace(self, prefix="calibrated ", progress=self._part(1 - 1 / runs, 1.0), similar=similar)
+        last = replace(self, prefix="calibrated ", progress=self._part(1 - 1 / runs, 1.0))
+        if case.waveform is None:  # a pulse begins with a phase of the one before, which converges in fewer cycles
+            last = replace(last, similar=similar)
         field = last.answer(calibration.scaled(case, factor), start)
         remark = f"calibrated: it resists {factor:.3g} times as much."
         if all(of_screen == of_walls for _, of_screen, of_walls in rounds):

@@ -12,16 +12,18 @@ from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
 from vstent.deployment.struts import is_over_restored
 from vstent.flow import simulation
-from vstent.flow.case import FlowCase, FlowField
+from vstent.flow.case import PHASES, FlowCase, FlowField
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.indices import indices, neck_diameter_mm
 from vstent.flow.lattice import calibration, stepping
 from vstent.flow.lattice.cost import estimate
-from vstent.flow.lattice.engine import LatticeBoltzmann
+from vstent.flow.lattice.engine import LatticeBoltzmann, PulsatileLatticeBoltzmann
 from vstent.flow.lattice.levels import sizes_mm
+from vstent.flow.lattice.state import State
 from vstent.flow.problem import flow_case
 from vstent.flow.settings import FlowSettings, Numerics
 from vstent.flow.simulation import simulate_case
+from vstent.flow.waveform import Waveform
 from vstent.geometry.vessel import Vessel
 from vstent.kernels.arrays import Floats
 from vstent.units import duration
@@ -217,6 +219,28 @@ def test_the_runs_of_a_calibrated_flow_are_stored_apart_from_those_with_the_scre
     assert [name for name in of_flows[1] if "answer" in name] == [
         f"{name} answer" for name in ("round 0", "round 1", "calibrated")
     ]
+
+
+def test_the_screen_of_a_pulsatile_flow_is_calibrated_in_steady_ones(
+    braided: FlowCase, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    of_wires = {"screen": (1.0, 1.0), "resolved": (0.9, 1.0)}
+    monkeypatch.setattr(calibration, "_resistance", lambda case, *_: of_wires[case.numerics.wires])
+    case = with_numerics(braided, cells_per_diameter=8.0, cells_across_neck=0.0, max_steps=100, max_cycles=1)
+    pulse, begun = with_numerics(replace(case, waveform=Waveform(0.1, (0.1,), (0.0,))), wires="calibrated"), []
+    bare, init = simulate_case(replace(pulse, media=(), solids=())), PulsatileLatticeBoltzmann.init
+
+    def watched(engine: PulsatileLatticeBoltzmann, case: FlowCase, start: FlowField) -> State:
+        begun.append(len(start.phases))
+        return init(engine, case, start)
+
+    monkeypatch.setattr(PulsatileLatticeBoltzmann, "init", watched)
+    field = simulate_case(pulse, start=bare)
+    assert begun[-1] > 0, "a pulse that begins with a steady flow needs more cycles"
+    assert len(field.phases) == PHASES
+    factor = calibration.next_factor([(1.0, 1.0, 0.9)])
+    factor = calibration.next_factor([(1.0, 1.0, 0.9), (factor, 1.0, 0.9)])
+    assert f"The screen is calibrated: it resists {factor:.3g} times" in field.advice
 
 
 @pytest.mark.validation

@@ -58,7 +58,7 @@ LIKE_FLOW: Final = 0.9
 
 def suits(case: FlowCase) -> bool:
     """Return whether the screen of a case can be calibrated: wires over a neck, with pores small against a tile."""
-    if case.wires is None or case.ostium is None or not case.media or not len(_samples(case)[0]):
+    if not case.has_screen or case.ostium is None or not case.media or not len(_samples(case)[0]):
         return False
     return all(one.normals.any() and np.median(one.spacing_mm) < WIDEST_PORES_MM for one in case.media)
 

@@ -212,8 +212,11 @@ def near_narrow(case: FlowCase, grid: Domain) -> Bools:
 
 def _reach_mm(case: FlowCase, size_mm: float, finest_mm: float) -> float:
     """Return the distance to which a grid with this spacing is refined around wires or a neck (see `_around`)."""
-    assert case.wires is not None
-    own_mm = thickness_mm(case.wires) if case.numerics.wires == "resolved" else SCREEN_CELLS * size_mm
+    if case.has_screen:
+        own_mm = SCREEN_CELLS * size_mm
+    else:
+        assert case.wires is not None
+        own_mm = thickness_mm(case.wires)
     return own_mm + MARGIN_CELLS * max(0.0, size_mm - WIDTH * finest_mm)
 
 
@@ -223,10 +226,10 @@ def _around(case: FlowCase) -> Surface:
     Walls are the wires in the sac and near its neck, or simply all if none are. The neck is the same for all devices in
     a vessel, which share the grids.
     """
-    assert case.wires is not None
-    if case.numerics.wires != "resolved":
+    if case.has_screen:
         assert case.ostium is not None
         return case.ostium
+    assert case.wires is not None
     if case.sac is None:
         return case.wires
     is_near = case.sac.signed_distance(case.wires.corners_mm.mean(axis=1)) < BESIDE_NECK * thickness_mm(case.wires)
@@ -330,13 +333,11 @@ def around_wires_mm(case: FlowCase) -> float:
     Walls need cells across a wire, and a screen `cells_across_neck`.
     """
     numerics = case.numerics
-    if case.wires is None:
-        return inf
-    if numerics.wires == "resolved":
+    if numerics.wires == "resolved" and case.wires is not None:
         return thickness_mm(case.wires) / domains.LEAST_ACROSS
-    if case.ostium is None or numerics.cell_size_mm is not None or numerics.device_gpu:
-        return inf
-    return neck_diameter_mm(case.ostium) / max(numerics.cells_across_neck, 1e-9)
+    if case.has_screen and case.ostium is not None and numerics.cell_size_mm is None and not numerics.device_gpu:
+        return neck_diameter_mm(case.ostium) / max(numerics.cells_across_neck, 1e-9)
+    return inf
 
 
 def refined(case: FlowCase, coarse: Grid, finest_mm: float) -> tuple[Grid, Grid, Interface]:
