@@ -1,7 +1,7 @@
 """The screen beside resolved struts, over necks and branches: write `struts.json`, print it as a table.
 
 Usage: python benchmarks/struts.py [--vessel demo|arc|tee] [--cell MM] [--foam-cell MM] [--across CELLS] [-j N]
-                                   [--cases FOLDER] [--walls MM] [DEVICE ...]
+                                   [--cases FOLDER] [--wires WORD] [DEVICE ...]
 
 The demo's artery, an arc of one with a sac at its side, cut to 9 mm on either side of the sac, or a straight one with a
 small sac, cut to 3 mm, is computed twice
@@ -11,9 +11,9 @@ part of the device that OpenFOAM meshes (`vstent.deployment.struts.over_restored
 what lies on the artery's wall, is kept besides. The two engines differ in the bare vessel already: what a device
 leaves of each engine's own bare value stands beside. `alignment` is the correlation of the two velocity fields in the
 sac, 1 where they are alike but for their size. A row is kept for every device in every vessel; other rows stay as they
-are. With --walls, only the embedded engine computes, with the wires as walls of a grid of that spacing, and prints what
-it finds. With --cases, OpenFOAM's cases stay in that folder, by vessel and device, and one that is there already
-resumes.
+are. With --wires, only the embedded engine computes, takes the wires in that way (``vstent run --wires``), at a spacing
+of its own where none is given, and prints what it finds. With --cases, OpenFOAM's cases stay in that folder, by vessel
+and device, and one that is there already resumes.
 """
 
 import argparse
@@ -23,6 +23,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import get_args
 
 import numpy as np
 
@@ -39,7 +40,7 @@ from vstent.flow.indices import indices
 from vstent.flow.openfoam import setup
 from vstent.flow.openfoam.engine import OpenFoam
 from vstent.flow.problem import flow_case
-from vstent.flow.settings import OPENFOAM, FlowSettings
+from vstent.flow.settings import OPENFOAM, FlowSettings, Wires
 from vstent.flow.simulation import simulate_case
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Vessel
@@ -118,19 +119,20 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("devices", nargs="*", default=["enterprise", "silk"])
     parser.add_argument("--vessel", choices=VESSELS, default="demo")
-    parser.add_argument("--cell", type=float, default=0.125)
+    parser.add_argument("--cell", type=float)
     parser.add_argument("--foam-cell", type=float, default=0.2)
     parser.add_argument("--across", type=float, default=setup.ACROSS)
     parser.add_argument("-j", dest="processes", type=int, default=1)
     parser.add_argument("--cases", type=Path)
-    parser.add_argument("--walls", type=float)
+    parser.add_argument("--wires", choices=get_args(Wires))
     given = parser.parse_args()
     make, kept_mm = VESSELS[given.vessel]
-    if given.walls:
+    if given.wires:
         for _, case in cases(given.devices, make(), kept_mm).values():
             if case.solids:
-                computed(case, None, cell_size_mm=given.walls, wires="resolved")
+                computed(case, None, cell_size_mm=given.cell, wires=given.wires)
         raise SystemExit
+    given.cell = given.cell or 0.125
     setup.ACROSS = given.across
     rows = json.loads(TABLE.read_text()) if TABLE.exists() else {}
     foam = {"engine": OPENFOAM, "cell_size_mm": given.foam_cell, "processes": given.processes}

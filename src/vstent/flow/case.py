@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from vstent.deployment.struts import struts
-from vstent.devices.stent import Stent
+from vstent.devices.stent import Coils, Stent
 from vstent.flow.ends import End, FlowRate, Inflow, Resistance
 from vstent.flow.forks import arm_impedance
 from vstent.flow.settings import Blood, Numerics
@@ -104,6 +104,12 @@ class FlowCase:
         """Closed solids of the implants' wires over necks and ostia, which may overlap; None where there are none."""
         solids = [struts(stent) for stent in self.solids if len(stent.wire_points_mm)]
         return joined(solids) if solids else None
+
+    @property
+    def has_screen(self) -> bool:
+        """Whether a neck or an ostium has wires over it other than those of coils, and they are media."""
+        wires = (one for one in self.solids if not isinstance(one, Coils))
+        return self.numerics.wires != "resolved" and any(len(one.wire_points_mm) for one in wires)
 
     @property
     def inlets_mL_s(self) -> Floats:

@@ -147,8 +147,9 @@ def _decided(case: FlowCase) -> tuple[FlowCase, str]:
     if USUAL_PART * cost.seconds < QUICK_S and cost.memory_bytes < free_memory_bytes():
         return _with_wires(case, "resolved"), ""
     if calibration.suits(case):
-        seconds = calibration.seconds(case) + calibration.ROUNDS * USUAL_PART * estimate(screen).seconds
-        if seconds < QUICK_S:
+        of_tiles_s, of_tile_bytes = calibration.cost(case)
+        seconds = of_tiles_s + calibration.ROUNDS * USUAL_PART * estimate(screen).seconds
+        if seconds < QUICK_S and of_tile_bytes < free_memory_bytes():
             return _with_wires(case, "calibrated"), f" The wires are a calibrated screen: {how}"
         how += f" Calibrating them would take about {duration(seconds)}."
     return screen, f" The wires are a screen: {how}"
@@ -167,13 +168,33 @@ def _resisted(case: FlowCase, bare: FlowField | None) -> FlowCase:
 
 def foretell_cost(case: FlowCase) -> str:
     """Return a sentence on the expected run time and memory of a flow; one that does not fit is refused."""
+    from vstent.flow.lattice import calibration
+
     case, remark = _decided(case)
-    return _engine_of(case)(default_cell_size_mm(case)).cost(case) + remark
+    sentence = _engine_of(case)(default_cell_size_mm(case)).cost(case)
+    if _is_calibrated(case):
+        of_tiles_s, of_tile_bytes = calibration.cost(case)
+        sentence += (
+            f" Calibrating the screen takes {calibration.ROUNDS} more such flows, {duration(of_tiles_s)} for wires as "
+            f"walls in pieces of the neck, and {of_tile_bytes / 1e9:.2g} GB."
+        )
+    return sentence + remark
 
 
 def memory_bytes(case: FlowCase) -> float | None:
     """Return the expected peak memory of a flow; None where its engine does not estimate it."""
-    return _engine_of(case)(default_cell_size_mm(case)).memory_bytes(case)
+    from vstent.flow.lattice import calibration
+
+    case, _ = _decided(case)
+    own = _engine_of(case)(default_cell_size_mm(case)).memory_bytes(case)
+    return max(own or 0.0, calibration.cost(case)[1]) if _is_calibrated(case) else own
+
+
+def _is_calibrated(case: FlowCase) -> bool:
+    """Return whether the screen of a case is calibrated."""
+    from vstent.flow.lattice import calibration
+
+    return case.numerics.wires == "calibrated" and _engine_of(case).has_levels and calibration.suits(case)
 
 
 def engine_class(numerics: Numerics, *, is_pulsatile: bool) -> type[AbstractEngine[Any]]:
@@ -249,7 +270,7 @@ class _Runs:
     similar: FlowField | None = None
     """Flow with a similar stent, from which the whole vessel starts."""
     prefix: str = ""
-    """Begin of the names of runs, which tells those before a calibration from the last one."""
+    """Begin of the names of runs, which differ from those with the screen as it is where it is calibrated."""
 
     def answer(self, case: FlowCase, start: FlowField | None) -> FlowField:
         """Compute a flow from a first guess on coarser grids, each of which starts from the next coarser one.
@@ -290,19 +311,27 @@ class _Runs:
         case, runs = _with_wires(case, "screen"), calibration.ROUNDS + 1
         if not calibration.suits(case):
             field = self.answer(case, start)
-            return replace(field, advice=f"{field.advice} The screen is not calibrated, because pores are too wide.")
+            why = " The screen is not calibrated: no wires over the neck, wires 0.4 mm apart or more, or coils."
+            return replace(field, advice=field.advice + why) if case.media else field
         similar, factor, size_mm = self.similar, 1.0, default_cell_size_mm(case)
         rounds: list[tuple[float, float, float]] = []
+        tile: calibration.Tile | None = None
         for number in range(runs - 1):
             steady = replace(calibration.scaled(case, factor), waveform=None)
             progress = self._part(number / runs, (number + 1) / runs)
-            now = replace(self, prefix=f"round {number} ", progress=progress, similar=similar)
-            similar = now.answer(steady, start)
-            rounds.append((factor, *calibration.read_off(steady, similar, size_mm)))
+            now = replace(self, engine=_engine_of(steady), prefix=f"round {number} ", progress=progress)
+            similar = replace(now, similar=similar).answer(steady, start)
+            tile = tile or calibration.strongest(steady, similar)
+            rounds.append((factor, *calibration.read_off(steady, tile, similar, size_mm)))
             factor = calibration.next_factor(rounds)
-        last = replace(self, progress=self._part(1 - 1 / runs, 1.0), similar=similar)
+        last = replace(self, prefix="calibrated ", progress=self._part(1 - 1 / runs, 1.0))
+        if case.waveform is None:  # a pulse begins with a phase of the one before, which converges in fewer cycles
+            last = replace(last, similar=similar)
         field = last.answer(calibration.scaled(case, factor), start)
-        return replace(field, advice=f"{field.advice} The screen is calibrated: it resists {factor:.3g} times as much.")
+        remark = f"calibrated: it resists {factor:.3g} times as much."
+        if all(of_screen == of_walls for _, of_screen, of_walls in rounds):
+            remark = "not calibrated: the force on its wires is not proportional to the flow through them."
+        return replace(field, advice=f"{field.advice} The screen is {remark}")
 
     def _bare(self, name: str, case: FlowCase, size_mm: float, finer: Guess, part: Part) -> FlowField | None:
         """Return the flow without a device on a coarse grid, from a finer one and computed only once; None without."""

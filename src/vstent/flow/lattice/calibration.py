@@ -12,16 +12,17 @@ the blood nearly stands still in it, so that a sixth less resistance changes the
 from collections.abc import Sequence
 from dataclasses import replace
 from math import log
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from vstent.deployment.struts import part_of
+from vstent.devices.stent import Stent
 from vstent.flow import sampling
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.lattice import stepping
-from vstent.flow.lattice.cost import seconds_of
+from vstent.flow.lattice.cost import memory_bytes, seconds_of
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.levels import sizes_mm
 from vstent.flow.lattice.pace import longest_step_s, peak_speed_m_s
@@ -57,20 +58,48 @@ LIKE_FLOW: Final = 0.9
 
 def suits(case: FlowCase) -> bool:
     """Return whether the screen of a case can be calibrated: wires over a neck, with pores small against a tile."""
-    if case.wires is None or case.ostium is None or not case.media:
+    if not case.has_screen or case.ostium is None or not case.media or not len(_samples(case)[0]):
         return False
     return all(one.normals.any() and np.median(one.spacing_mm) < WIDEST_PORES_MM for one in case.media)
 
 
-def read_off(case: FlowCase, flow: FlowField, cell_size_mm: float) -> tuple[float, float]:
-    """Return what the screen and the wires of a steady case resist to the blood in a flow, up to a common constant.
+class Tile(NamedTuple):
+    """A piece of the device."""
 
-    Both are equal where force and velocity are no measure of a resistance (see `LIKE_FLOW`).
+    center_mm: Floats
+    """(3,) its middle."""
+    solids: tuple[Stent, ...]
+    """Its wires."""
+
+    def walls(self, case: FlowCase) -> FlowCase:
+        """Return a case with these wires as walls."""
+        return replace(case, solids=self.solids, numerics=replace(case.numerics, wires="resolved"))
+
+
+def tile_at(case: FlowCase, center_mm: Floats) -> Tile:
+    """Return the wires of a case within `TILE_MM` of a point."""
+    return Tile(
+        center_mm,
+        tuple(part_of(one, lengths(one.wire_points_mm - center_mm) < TILE_MM) for one in case.solids),
+    )
+
+
+def strongest(case: FlowCase, flow: FlowField) -> Tile:
+    """Return the tile of the screen through which most blood passes in a flow, in the mean square."""
+    points_mm, normals, area_mm2 = _samples(case)
+    through_m_s = np.einsum("pd,pd->p", sampling.values_at(flow, points_mm)[0], normals)
+    strength = nearby.sums(points_mm, points_mm, (area_mm2 * through_m_s**2)[:, None], TILE_MM)
+    return tile_at(case, points_mm[strength[:, 0].argmax()])
+
+
+def read_off(case: FlowCase, tile: Tile, flow: FlowField, cell_size_mm: float) -> tuple[float, float]:
+    """Return what the screen of a steady case and the wires of a tile resist to a flow, up to a common constant.
+
+    Both are 1 where force and velocity are no measure of a resistance (see `LIKE_FLOW`).
     """
-    center_mm = _strongest_mm(case, flow)
-    of_screen, _ = _resistance(case, flow, cell_size_mm, center_mm)
-    of_walls, likeness = _resistance(tile(case, center_mm), flow, cell_size_mm, center_mm)
-    return of_screen, of_walls if likeness > LIKE_FLOW and of_walls > 0 else of_screen
+    of_screen, _ = _resistance(case, flow, cell_size_mm, tile.center_mm)
+    of_walls, likeness = _resistance(tile.walls(case), flow, cell_size_mm, tile.center_mm)
+    return (of_screen, of_walls) if likeness > LIKE_FLOW and min(of_screen, of_walls) > 0 else (1.0, 1.0)
 
 
 def next_factor(rounds: Sequence[tuple[float, float, float]]) -> float:
@@ -89,33 +118,18 @@ def scaled(case: FlowCase, factor: float) -> FlowCase:
     return replace(case, media=tuple(media))
 
 
-def seconds(case: FlowCase) -> float:
-    """Estimate the run time of all tiles of a case."""
+def cost(case: FlowCase) -> tuple[float, float]:
+    """Estimate the run time, s, of all tiles of a case, and the peak memory, bytes, of one."""
     assert case.ostium is not None
-    walls, size_mm = tile(case, case.ostium.vertices_mm.mean(axis=0)), default_cell_size_mm(case)
-    sizes = sizes_mm(walls, size_mm)
-    step_s = longest_step_s(case, sizes[-1], peak_speed_m_s(case, None))
-    return ROUNDS * seconds_of(walls, size_mm, settling_s(case) / step_s)
-
-
-def tile(case: FlowCase, center_mm: Floats) -> FlowCase:
-    """Return a case in which only the wires within `TILE_MM` of a point are walls."""
-    solids = (part_of(one, lengths(one.wire_points_mm - center_mm) < TILE_MM) for one in case.solids)
-    return replace(case, solids=tuple(solids), numerics=replace(case.numerics, wires="resolved"))
+    walls, size_mm = tile_at(case, case.ostium.vertices_mm.mean(axis=0)).walls(case), default_cell_size_mm(case)
+    step_s = longest_step_s(case, sizes_mm(walls, size_mm)[-1], peak_speed_m_s(case, None))
+    return ROUNDS * seconds_of(walls, size_mm, settling_s(case) / step_s), memory_bytes(walls)
 
 
 def settling_s(case: FlowCase) -> float:
     """Return the time for which a tile is computed."""
     spacing_m = M_PER_MM * float(np.mean([np.median(one.spacing_mm) for one in case.media]))
     return SETTLED * spacing_m**2 / case.blood.kinematic_viscosity_m2_s
-
-
-def _strongest_mm(case: FlowCase, flow: FlowField) -> Floats:
-    """Return the point of the screen around which most blood passes through it, in the mean square over a tile."""
-    points_mm, normals, area_mm2 = _samples(case)
-    through_m_s = np.einsum("pd,pd->p", sampling.values_at(flow, points_mm)[0], normals)
-    strength = nearby.sums(points_mm, points_mm, (area_mm2 * through_m_s**2)[:, None], TILE_MM)
-    return np.asarray(points_mm[strength[:, 0].argmax()])
 
 
 def _samples(case: FlowCase) -> tuple[Floats, Floats, Floats]:

@@ -76,14 +76,16 @@ BESIDE_NECK: Final = 6.0
 MARGIN_CELLS: Final = 14.0
 """Distance in cells by which a refined part around wires exceeds the next finer one: with less, the distance kept from
 the border and `RIM` leave no room for that along diagonals."""
-SCREEN_CELLS: Final = 2.0
-"""Further distance in cells around a screen, which is spread over layers of cells."""
+SCREEN_CELLS: Final = 4.0
+"""Distance in cells from a neck with a screen, which is spread over layers of cells, up to which a grid is refined."""
 CHANGING: Final = ("crossed", "lack", "push")
 """Arrays of an `Interface` that change during a run."""
 CHUNK: Final = 10_000
 """Number of cells whose stencils are computed at once."""
 MOST_PUSHED: Final = 0.03
 """Largest momentum that is added at a border, over that of the cells that are set."""
+AROUND: Final = np.indices((4, 4, 4)).reshape(3, -1).T - 1
+"""Places of the 64 cells of a stencil relative to the first of its middle cells."""
 REACH: Final = 1.2
 """Standard deviation in cells of the weights of a fit beside a wall."""
 RIDGE: Final = 1e-3
@@ -96,20 +98,22 @@ class Stencil:
 
     place: Ints
     """(c,) storage places of the cells read."""
+    block: Ints
+    """(b, 64) numbers, among these cells, of 4 x 4 x 4 cells, between whose middle ones lie eight target cells each."""
     start: Ints
-    """(n + 1,) first entry of each target cell."""
+    """(n + 1,) first entry of each further target cell."""
     cell: Ints
     """(e,) number, among these cells, of the one read."""
     weight: NDArray[np.float32]
     """(e, 2) weights of the even and of the odd part of the populations."""
     target: Ints
-    """(n,) storage places of the target cells."""
+    """(8 b + n,) storage places of the target cells, those in blocks first."""
     limit: NDArray[np.float32]
-    """(n,) largest grid Reynolds number there (see `setup.thickest`)."""
+    """(8 b + n,) largest grid Reynolds number there (see `setup.thickest`)."""
     group: Ints
-    """(n,) group of each of them."""
+    """(8 b + n,) group of each of them."""
     share: NDArray[np.float32]
-    """(n, 3) what it gets of the momentum added to its group normal to the border, in proportion to the wall
+    """(8 b + n, 3) what it gets of the momentum added to its group normal to the border, in proportion to the wall
     distance."""
 
 
@@ -207,19 +211,29 @@ def near_narrow(case: FlowCase, grid: Domain) -> Bools:
 
 
 def _reach_mm(case: FlowCase, size_mm: float, finest_mm: float) -> float:
-    """Return the distance from wires to which a grid with this spacing is refined: their thickness at the finest."""
-    assert case.wires is not None
-    own_mm = 0.0 if case.numerics.wires == "resolved" else SCREEN_CELLS * size_mm
-    return own_mm + thickness_mm(case.wires) + MARGIN_CELLS * max(0.0, size_mm - WIDTH * finest_mm)
+    """Return the distance to which a grid with this spacing is refined around wires or a neck (see `_around`)."""
+    if case.has_screen:
+        own_mm = SCREEN_CELLS * size_mm
+    else:
+        assert case.wires is not None
+        own_mm = thickness_mm(case.wires)
+    return own_mm + MARGIN_CELLS * max(0.0, size_mm - WIDTH * finest_mm)
 
 
-def _walls(case: FlowCase) -> Surface:
-    """Return the part of the wires that finer levels take as walls: all in the sac and near its neck."""
+def _around(case: FlowCase) -> Surface:
+    """Return what finer levels lie around: a neck with a screen, or wires that are walls.
+
+    Walls are the wires in the sac and near its neck, or simply all if none are. The neck is the same for all devices in
+    a vessel, which share the grids.
+    """
+    if case.has_screen:
+        assert case.ostium is not None
+        return case.ostium
     assert case.wires is not None
     if case.sac is None:
         return case.wires
     is_near = case.sac.signed_distance(case.wires.corners_mm.mean(axis=1)) < BESIDE_NECK * thickness_mm(case.wires)
-    return Surface(case.wires.vertices_mm, case.wires.faces[is_near])
+    return Surface(case.wires.vertices_mm, case.wires.faces[is_near]) if is_near.any() else case.wires
 
 
 def beside_walls(case: FlowCase, blood_mm: Floats) -> FlowCase:
@@ -241,18 +255,18 @@ def beside_walls(case: FlowCase, blood_mm: Floats) -> FlowCase:
 
 
 def near_wires(case: FlowCase, grid: Domain, finest_mm: float) -> Bools:
-    """Return whether each cell (n,) lies near wires that finer levels take as walls, the finest with this spacing."""
-    wires, reach_mm = _walls(case), _reach_mm(case, grid.cell_size_mm, finest_mm)
-    low, high = wires.vertices_mm.min(axis=0) - reach_mm, wires.vertices_mm.max(axis=0) + reach_mm
+    """Return whether each cell (n,) lies near the wires or the neck of a case, where the finest has this spacing."""
+    around, reach_mm = _around(case), _reach_mm(case, grid.cell_size_mm, finest_mm)
+    low, high = around.vertices_mm.min(axis=0) - reach_mm, around.vertices_mm.max(axis=0) + reach_mm
     result = ((grid.centers_mm > low) & (grid.centers_mm < high)).all(axis=1)
-    result[result] = wires.closest(grid.centers_mm[result])[1] < reach_mm
+    result[result] = around.closest(grid.centers_mm[result])[1] < reach_mm
     return result
 
 
 def volume_near_wires_mm3(case: FlowCase, size_mm: float, finest_mm: float) -> float:
-    """Estimate the volume of what is refined around wires on a grid with this spacing."""
+    """Estimate the volume of what is refined around wires or a neck on a grid with this spacing."""
     reach_mm = _reach_mm(case, size_mm, finest_mm) + 1.2 * RIM * size_mm
-    step_mm, corners_mm = reach_mm / 4, _walls(case).corners_mm
+    step_mm, corners_mm = reach_mm / 4, _around(case).corners_mm
     low_mm = corners_mm.min(axis=(0, 1)) - reach_mm - 2 * step_mm
     at = np.rint((corners_mm.mean(axis=1) - low_mm) / step_mm).astype(int)
     is_blood = np.ones(at.max(axis=0) + 7, dtype=bool)
@@ -319,13 +333,11 @@ def around_wires_mm(case: FlowCase) -> float:
     Walls need cells across a wire, and a screen `cells_across_neck`.
     """
     numerics = case.numerics
-    if case.wires is None:
-        return inf
-    if numerics.wires == "resolved":
+    if numerics.wires == "resolved" and case.wires is not None:
         return thickness_mm(case.wires) / domains.LEAST_ACROSS
-    if case.ostium is None or numerics.cell_size_mm is not None or numerics.device_gpu:
-        return inf
-    return neck_diameter_mm(case.ostium) / max(numerics.cells_across_neck, 1e-9)
+    if case.has_screen and case.ostium is not None and numerics.cell_size_mm is None and not numerics.device_gpu:
+        return neck_diameter_mm(case.ostium) / max(numerics.cells_across_neck, 1e-9)
+    return inf
 
 
 def refined(case: FlowCase, coarse: Grid, finest_mm: float) -> tuple[Grid, Grid, Interface]:
@@ -450,18 +462,22 @@ def stencil(read: Grid, written: Grid, target: Ints, group: Ints, share: Floats)
 
     Those with no cell of the first grid near them are left out.
     """
-    pieces = np.split(target, np.arange(CHUNK, len(target), CHUNK))
+    corners, order = _blocks(read.domain, written.domain, target)
+    target, group, share = target[order], group[order], share[order]
+    block, first = _cells_around(read.domain, corners), 8 * len(corners)
+    pieces = np.split(target[first:], np.arange(CHUNK, len(target) - first, CHUNK))
     parts = [_weights(read.domain, written.domain, piece) for piece in pieces]
     counts, cell = (np.concatenate([part[k] for part in parts]) for k in range(2))
     weight = np.concatenate([part[2] for part in parts])
-    is_near = counts > 0
+    is_near = np.r_[np.ones(first, dtype=bool), counts > 0]
     target, group, share = target[is_near], group[is_near], share[is_near]
     is_read = np.zeros(len(read.domain.cells), dtype=bool)
-    is_read[cell] = True
+    is_read[cell] = is_read[block] = True
     number = np.cumsum(is_read, dtype=np.int32) - 1
     return Stencil(
         read.addressing.place[is_read],
-        np.r_[0, np.cumsum(counts[is_near])].astype(np.int32),
+        number[block],
+        np.r_[0, np.cumsum(counts[counts > 0])].astype(np.int32),
         number[cell],
         weight,
         written.addressing.place[target],
@@ -471,27 +487,59 @@ def stencil(read: Grid, written: Grid, target: Ints, group: Ints, share: Floats)
     )
 
 
+def _cells_around(source: Domain, corner: Ints) -> Ints:
+    """Return the cells (m, 64) around grid points (m, 3), which are the first of the two middle ones on every axis."""
+    index = np.pad(source.index, 4, constant_values=-1)
+    limit: Ints = np.array(index.shape) - 1
+    return index[tuple(np.moveaxis(np.clip(corner[:, None] + AROUND + 4, 0, limit), -1, 0))]
+
+
+def _is_whole(source: Domain, cell: Ints) -> Bools:
+    """Return whether cells (m, 64) are all blood without a septum."""
+    of_septa = np.zeros(len(source.cells) + 1, dtype=bool)
+    of_septa[source.septum_cell] = True
+    return np.asarray(((cell >= 0) & ~of_septa[cell]).all(axis=1))
+
+
+def _cubic(t: Floats) -> Floats:
+    """Return the weights (m, 64) of Lagrange's cubic polynomials at places t (m, 3) between the middle cells."""
+    nodes = np.array([-1, 0, 1, 2])
+    others = np.array([[0, 1, 2], [-1, 1, 2], [-1, 0, 2], [-1, 0, 1]])
+    cubic = (t[..., None, None] - others).prod(axis=3) / (nodes[:, None] - others).prod(axis=1)
+    return np.einsum("ma,mb,mc->mabc", cubic[:, 0], cubic[:, 1], cubic[:, 2]).reshape(len(t), -1)
+
+
+def in_block() -> NDArray[np.float32]:
+    """Return the weights (2, 64, 4) with which the first and last four target cells of a block read (see `Stencil`)."""
+    weight = _cubic(np.indices((WIDTH,) * 3).reshape(3, -1).T / WIDTH + 0.5 / WIDTH)
+    return np.ascontiguousarray(weight.reshape(2, 4, -1).transpose(0, 2, 1), dtype=np.float32)
+
+
+def _blocks(source: Domain, other: Domain, target: Ints) -> tuple[Ints, Ints]:
+    """Return the corners (b, 3) of blocks of `source` with eight target cells (n,), and an order (n,) of the targets.
+
+    It begins with those in blocks, block by block. On a coarser grid there are none.
+    """
+    at = source.places(other.centers_mm[target])
+    corner = np.floor(at).astype(int)
+    corners, of_target, count = np.unique(corner, axis=0, return_inverse=True, return_counts=True)
+    found = np.flatnonzero(count == WIDTH**3)
+    found = found[_is_whole(source, _cells_around(source, corners[found]))]
+    rank = np.full(len(corners), len(corners))
+    rank[found] = np.arange(len(found))
+    return corners[found], np.lexsort((*(at - corner).T[::-1], rank[of_target.ravel()]))
+
+
 def _weights(source: Domain, other: Domain, target: Ints) -> tuple[Ints, Ints, NDArray[np.float32]]:
     """Return the number (m,) of cells of `source` read for each cell `target` of another grid, them, and weights."""
     at = source.places(other.centers_mm[target])
     corner = np.floor(at).astype(int)
-    offset = np.indices((4, 4, 4)).reshape(3, -1).T - 1
-    around = corner[:, None] + offset
-    index = np.pad(source.index, 4, constant_values=-1)
-    limit: Ints = np.array(index.shape) - 1
-    cell = index[tuple(np.moveaxis(np.clip(around + 4, 0, limit), -1, 0))]
-    of_septa = np.zeros(len(source.cells) + 1, dtype=bool)
-    of_septa[source.septum_cell] = True
-    is_whole = ((cell >= 0) & ~of_septa[cell]).all(axis=1)
-    t = (at - corner)[..., None]
-    nodes = np.array([-1, 0, 1, 2])
-    others = np.array([[0, 1, 2], [-1, 1, 2], [-1, 0, 2], [-1, 0, 1]])
-    cubic = (t[..., None] - others).prod(axis=3) / (nodes[:, None] - others).prod(axis=1)  # Lagrange's polynomials
-    even = np.einsum("ma,mb,mc->mabc", cubic[:, 0], cubic[:, 1], cubic[:, 2]).reshape(len(at), -1)
+    cell = _cells_around(source, corner)
+    even = _cubic(at - corner)
     odd = even.copy()
-    beside = np.flatnonzero(~is_whole)
+    beside = np.flatnonzero(~_is_whole(source, cell))
     if len(beside):
-        away = offset - (at - corner)[beside][:, None]
+        away = AROUND - (at - corner)[beside][:, None]
         even[beside], odd[beside] = _beside_wall(source, other, target[beside], cell[beside], away)
     is_used = (cell >= 0) & (even != 0)
     weight = np.stack([even[is_used], odd[is_used]], axis=1).astype(np.float32)

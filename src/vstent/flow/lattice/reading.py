@@ -160,12 +160,13 @@ def _remarks(state: State, levels: Sequence[Level], phases: Sequence[Phase]) -> 
             f" The wires are walls, {thickness_mm(wires) / finest.cell_size_mm:.2g} cells thick; {finest.closed_gaps} "
             "cells in gaps narrower than a cell are closed."
         )
-    elif case.wires is not None and case.ostium is not None:
+    elif case.has_screen and case.ostium is not None:
         across = neck_diameter_mm(case.ostium) / finest.cell_size_mm
         if across < FEWEST_ACROSS_NECK:
             remarks += (
                 f" Under-resolved neck: it has {across:.0f} cells across. With fewer than {FEWEST_ACROSS_NECK} behind "
-                "a dense braid, neck inflow and sac velocity are up to a third too high: leave the grid spacing open."
+                "a dense braid, neck inflow and sac velocity are up to a third too high: use a grid spacing of "
+                f"{across / FEWEST_ACROSS_NECK * finest.cell_size_mm:.2g} mm or, on the processor, leave it open."
             )
     if len(state.levels) > 1:
         sizes = ", ".join(f"{one.domain.cell_size_mm:.3g} mm ({len(one.domain.cells):,} cells)" for one in state.levels)

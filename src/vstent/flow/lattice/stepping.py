@@ -1,10 +1,10 @@
 """Build a lattice-Boltzmann run and advance it from check to check."""
 
 from collections import deque
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from time import perf_counter
-from typing import Final
+from typing import Any, Final
 from weakref import WeakKeyDictionary
 
 import numba
@@ -28,6 +28,7 @@ from vstent.flow.lattice.levels import (
     Interface,
     Stencil,
     beside_walls,
+    in_block,
     refined,
     sizes_mm,
 )
@@ -52,7 +53,9 @@ LEARNED: Final = 2
 """Number of harmonics of a pulse for which the delay of an outlet is corrected: cycles that correct more converge
 slowly."""
 
-_GRIDS: WeakKeyDictionary[Vessel, dict[Hashable, list[tuple[Grid, Interface | None]]]] = WeakKeyDictionary()
+IN_BLOCK: Final = in_block()
+"""Weights of the target cells in a block (see `exchange.carry`)."""
+_GRIDS: WeakKeyDictionary[Vessel, dict[tuple[Any, ...], list[tuple[Grid, Interface | None]]]] = WeakKeyDictionary()
 """Grids by grid spacing, refined part and resolved wires, as long as the vessel exists."""
 
 
@@ -143,14 +146,16 @@ def prepare(case: FlowCase, cell_size_mm: float) -> None:
 def _grids(case: FlowCase, cell_size_mm: float) -> list[tuple[Grid, Interface | None]]:
     """Return the grids of a case, coarse to fine, each with its coupling to the next coarser one.
 
-    Flows in the same vessel with the same walls share them.
+    Flows in the same vessel with the same walls share them. Of those with walls the last is kept.
     """
     built = _GRIDS.setdefault(case.vessel, {})
-    sizes, numerics = sizes_mm(case, cell_size_mm), case.numerics
+    sizes = sizes_mm(case, cell_size_mm)
     coarsest_mm, finest_mm = sizes[0], sizes[-1]
     are_walls = domains.wires_of(case, finest_mm) is not None
-    key = sizes, case.sac if numerics.close_up else None, case.solids if are_walls else ()
+    key = sizes, case.sac if len(sizes) > 1 else None, case.solids if are_walls else ()
     if key not in built:
+        for of_walls in [other for other in built if other[2]]:  # of another device, or of another tile of it
+            del built[of_walls]
         domain = domains.build(case.vessel, coarsest_mm, wires=domains.wires_of(case, coarsest_mm))
         limit = thickest(case, domain)
         grids: list[tuple[Grid, Interface | None]] = [(Grid(domain, limit, address(domain, limit)), None)]
@@ -429,7 +434,7 @@ def _carry(source: State, target: State, along: Stencil, push: Floats, ratio: fl
     scales, rates = source.scales, (np.float32(source.scales.odd_rate), np.float32(target.scales.odd_rate))
     numbers = np.float32(ratio), np.float32(scales.relaxation_steps), scales.thinning, *rates
     into = target.populations, target.addressing.stride, along.target, along.limit
-    read = along.place, along.start, along.cell, along.weight, along.group, along.share
+    read = along.place, along.block, IN_BLOCK, along.start, along.cell, along.weight, along.group, along.share
     exchange.carry(source.populations, source.addressing.stride, read, push, into, numbers)
 
 
