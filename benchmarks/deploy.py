@@ -25,8 +25,7 @@ from vstent.deployment.method import Placement, run
 from vstent.deployment.sketch import measured_wall, sketch
 from vstent.deployment.struts import struts
 from vstent.deployment.wall import AbstractWall, Contact, landing_wall
-from vstent.devices import catalogue
-from vstent.devices import design as device
+from vstent.devices import catalogue, design as device
 from vstent.devices.stent import Landing, Stent
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.surfaces import read_surface

@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from faults import image_file, scan, surface_file, vtk_image_file
-from hypothesis import HealthCheck, example, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, example, given, settings, strategies as st
 
 from vstent.children import environment
 from vstent.devices.design import Braid, LaserCut

@@ -14,34 +14,33 @@ if TYPE_CHECKING:
     from vstent.anatomy.segment import segment as segment
     from vstent.anatomy.trace import trace as trace
     from vstent.anatomy.trim import trim as trim
-    from vstent.angiography.angiogram import AngiogramSettings as AngiogramSettings
-    from vstent.angiography.angiogram import angiogram as angiogram
+    from vstent.angiography.angiogram import AngiogramSettings as AngiogramSettings, angiogram as angiogram
     from vstent.deployment.deploy import deploy as deploy
     from vstent.deployment.measure import measure as measure
     from vstent.deployment.straightening import straighten as straighten
     from vstent.deployment.struts import struts as struts
-    from vstent.devices.catalogue import catalogue as catalogue
-    from vstent.devices.catalogue import find_design as find_design
-    from vstent.devices.catalogue import find_size as find_size
+    from vstent.devices.catalogue import catalogue as catalogue, find_design as find_design, find_size as find_size
     from vstent.devices.stent import Landing as Landing
-    from vstent.devices.treatment import Implant as Implant
-    from vstent.devices.treatment import Placing as Placing
-    from vstent.devices.treatment import Treatment as Treatment
-    from vstent.devices.treatment import read_treatment as read_treatment
-    from vstent.flow.indices import compare as compare
-    from vstent.flow.indices import indices as indices
+    from vstent.devices.treatment import (
+        Implant as Implant,
+        Placing as Placing,
+        Treatment as Treatment,
+        read_treatment as read_treatment,
+    )
+    from vstent.flow.indices import compare as compare, indices as indices
     from vstent.flow.ostium import ostium as ostium
-    from vstent.flow.settings import FlowSettings as FlowSettings
-    from vstent.flow.settings import Numerics as Numerics
+    from vstent.flow.settings import FlowSettings as FlowSettings, Numerics as Numerics
     from vstent.flow.simulation import simulate as simulate
     from vstent.geometry.image import Image as Image
     from vstent.io.images import read_image as read_image
     from vstent.plan.rank import rank as rank
     from vstent.reporting.page import report as report
     from vstent.study.pipeline import run as run
-    from vstent.study.settings import AnatomySettings as AnatomySettings
-    from vstent.study.settings import InputSettings as InputSettings
-    from vstent.study.settings import Settings as Settings
+    from vstent.study.settings import (
+        AnatomySettings as AnatomySettings,
+        InputSettings as InputSettings,
+        Settings as Settings,
+    )
 
 _HOMES = {
     "read_vessel": "vstent.anatomy.read",

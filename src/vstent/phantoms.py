@@ -126,17 +126,6 @@ class Phantom:
         """True area of the parent artery's wall inside the ellipsoids; 0 without a sac."""
         return self._sac_layers[1]
 
-    @property
-    def neck_center_mm(self) -> Floats:
-        """(3,) point of the parent artery's wall under the center of the sac; ValueError without a sac."""
-        if self.sac is None:
-            raise ValueError(f"phantom {self.name} has no sac")
-        abscissa = self.parent.nearest_abscissa_mm(self.sac.center_mm[None])
-        foot = self.parent.at(abscissa)[0]
-        outward = (self.sac.center_mm - foot) / np.linalg.norm(self.sac.center_mm - foot)
-        radius = np.interp(abscissa[0], self.parent.abscissa_mm, self.parent.inscribed_radius_mm)
-        return foot + radius * outward
-
     @cached_property
     def _sac_layers(self) -> tuple[float, float]:
         """Return sac volume and neck area, integrated on a grid with a spacing of 1/40 of the larger semi-axis."""
@@ -241,16 +230,6 @@ def with_sac(
     lift = height * np.sqrt(1.0 - (neck_mm / width_mm) ** 2)
     center = parent.points_mm[i] + (parent.inscribed_radius_mm[i] + lift) * across
     return replace(phantom, name=f"{phantom.name} with sac", sac=Sac(center, across, 0.5 * width_mm, height))
-
-
-def with_bleb(phantom: Phantom, *, direction: Floats, radius_mm: float = 1.2) -> Phantom:
-    """Return a phantom with a round daughter sac, half of which protrudes from its sac in a direction (3,)."""
-    if phantom.sac is None:
-        raise ValueError(f"phantom {phantom.name} has no sac")
-    unit = np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
-    level, _ = phantom.sac.implicit_mm(phantom.sac.center_mm + unit[None] * phantom.sac.reach_mm)
-    center = phantom.sac.center_mm + (phantom.sac.reach_mm - level[0]) * unit
-    return replace(phantom, blebs=(*phantom.blebs, Sac(center, unit, radius_mm, radius_mm)))
 
 
 def with_branch(

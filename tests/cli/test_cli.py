@@ -18,8 +18,7 @@ from shapes import sphere
 from vessel_truth import read_centerlines
 
 from vstent import phantoms
-from vstent.cli import main, rank
-from vstent.cli import run as cli_run
+from vstent.cli import main, rank, run as cli_run
 from vstent.errors import InputError
 from vstent.flow.settings import FlowSettings
 from vstent.geometry.surface import Surface

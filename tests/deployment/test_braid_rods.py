@@ -9,8 +9,7 @@ import pytest
 from tubes import arc, line, tube
 
 from vstent.deployment.deploy import deploy
-from vstent.devices import design as device
-from vstent.devices import formulas
+from vstent.devices import design as device, formulas
 from vstent.devices.stent import Landing
 
 RODS = json.loads((Path(__file__).parents[1] / "helpers" / "data" / "braid_rods.json").read_text())

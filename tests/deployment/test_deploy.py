@@ -18,8 +18,7 @@ from vstent.deployment.deploy import deploy, propose_landing, propose_size
 from vstent.deployment.measure import measure
 from vstent.deployment.method import SPARE_MM, check_inside, laid_inside
 from vstent.deployment.sketch import measured_wall, sketch
-from vstent.devices import catalogue, formulas
-from vstent.devices import design as device
+from vstent.devices import catalogue, design as device, formulas
 from vstent.devices.stent import Landing
 from vstent.errors import LandingError
 from vstent.geometry.surface import Surface

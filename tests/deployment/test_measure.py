@@ -12,8 +12,7 @@ from vstent.anatomy.morphology import morphology
 from vstent.deployment.coverage import coverage_fractions, is_over_neck, pore_areas_mm2
 from vstent.deployment.deploy import deploy
 from vstent.deployment.measure import measure
-from vstent.devices import catalogue, formulas
-from vstent.devices import design as device
+from vstent.devices import catalogue, design as device, formulas
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Aneurysm, Centerline
 from vstent.plan.rank import rank

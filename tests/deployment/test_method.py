@@ -18,8 +18,7 @@ from vstent.deployment.deploy import deploy
 from vstent.deployment.measure import measure, wire_stretches
 from vstent.deployment.method import Zhong2016
 from vstent.deployment.wall import inner_nodes_mm
-from vstent.devices import catalogue, formulas
-from vstent.devices import design as device
+from vstent.devices import catalogue, design as device, formulas
 from vstent.devices.stent import Landing
 from vstent.errors import DeviceError, InputError, LandingError
 from vstent.geometry.surface import Surface

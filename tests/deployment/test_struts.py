@@ -12,8 +12,7 @@ from tubes import arc, line, tube, with_neck
 from vstent.deployment import wires
 from vstent.deployment.deploy import deploy
 from vstent.deployment.struts import blood, over_restored, struts, united
-from vstent.devices import catalogue, formulas
-from vstent.devices import design as device
+from vstent.devices import catalogue, design as device, formulas
 from vstent.errors import DeviceError
 from vstent.geometry.surface import Surface
 

@@ -5,9 +5,7 @@ import numpy as np
 import pytest
 
 from vstent.cli import main
-from vstent.devices import catalogue, formulas, ranges
-from vstent.devices import design as device
-from vstent.devices import schema as device_schema
+from vstent.devices import catalogue, design as device, formulas, ranges, schema as device_schema
 from vstent.devices.design import Braid, LaserCut, Size, Strands, angle_rad
 from vstent.errors import DeviceError
 

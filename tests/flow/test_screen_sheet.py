@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from vstent.flow.case import Sheet
-from vstent.flow.drag import COIL_INERTIA, concentration, drag_per_length
-from vstent.flow.drag import permeability_mm2 as permeability_mm2_of
+from vstent.flow.drag import COIL_INERTIA, concentration, drag_per_length, permeability_mm2 as permeability_mm2_of
 from vstent.flow.lattice.kernels import d3q19, lanes
 from vstent.flow.lattice.scales import ODD_RATE
 from vstent.flow.lattice.screen import on_grid

@@ -11,8 +11,7 @@ import pytest
 from vstent import phantoms
 from vstent.anatomy.openings import open_ends
 from vstent.anatomy.trace import trace
-from vstent.flow import domain, sampling
-from vstent.flow import simulation as flow
+from vstent.flow import domain, sampling, simulation as flow
 from vstent.flow.case import FlowCase, FlowField, Sheet
 from vstent.flow.engines import AbstractEngine, Outcome, run
 from vstent.flow.indices import indices

@@ -1,6 +1,7 @@
 """Arteries with a glued sac of known neck and volume: tests assert what is found of them, the benchmark prints it."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +13,29 @@ from vstent.anatomy.trace import trace
 from vstent.geometry.vessel import Anatomy, Vessel
 from vstent.io.surfaces import read_surface
 from vstent.kernels import curves
-from vstent.phantoms import Phantom, Scanner, torus_arc, tube, with_bleb, with_branch, with_sac
+from vstent.phantoms import Phantom, Sac, Scanner, torus_arc, tube, with_branch, with_sac
 
 
 def _inside(angle_rad: float) -> np.ndarray:
     return -np.array([np.cos(angle_rad), 0.0, np.sin(angle_rad)])
+
+
+def with_bleb(phantom: Phantom, *, direction: np.ndarray, radius_mm: float = 1.2) -> Phantom:
+    """Return a phantom with a round daughter sac, half of which protrudes from its sac in a direction (3,)."""
+    assert phantom.sac is not None
+    unit = direction / np.linalg.norm(direction)
+    level, _ = phantom.sac.implicit_mm(phantom.sac.center_mm + unit[None] * phantom.sac.reach_mm)
+    center = phantom.sac.center_mm + (phantom.sac.reach_mm - level[0]) * unit
+    return replace(phantom, blebs=(*phantom.blebs, Sac(center, unit, radius_mm, radius_mm)))
+
+
+def neck_center_mm(phantom: Phantom) -> np.ndarray:
+    """The point (3,) of the parent artery's wall under the center of the sac."""
+    assert phantom.sac is not None
+    abscissa_mm = phantom.parent.nearest_abscissa_mm(phantom.sac.center_mm[None])
+    foot_mm = phantom.parent.at(abscissa_mm)[0]
+    outward = (phantom.sac.center_mm - foot_mm) / np.linalg.norm(phantom.sac.center_mm - foot_mm)
+    return foot_mm + np.interp(abscissa_mm[0], phantom.parent.abscissa_mm, phantom.parent.inscribed_radius_mm) * outward
 
 
 X = np.array([1.0, 0.0, 0.0])

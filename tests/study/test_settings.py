@@ -13,8 +13,7 @@ from vstent.app.choices import Choices
 from vstent.cli import options
 from vstent.errors import InputError
 from vstent.fields import Option, flag, sections_of
-from vstent.study.settings import OPTIONS, Settings, settings_of
-from vstent.study.settings import STATED as PATHS
+from vstent.study.settings import OPTIONS, STATED as PATHS, Settings, settings_of
 
 IN_TEXT = "stated in the text of --treatment"
 OF_METHOD = "a parameter of the method, validated at its default; Python sets it"

@@ -7,8 +7,7 @@ from vstent.angiography.transport import warm as warm_contrast
 from vstent.children import environment
 from vstent.deployment.coils import warm as warm_coils
 from vstent.flow.lattice.kernels.warm import flow
-from vstent.kernels.warm import project, sample
-from vstent.kernels.warm import warm as warm_shared
+from vstent.kernels.warm import project, sample, warm as warm_shared
 
 
 def warm(*, has_contrast: bool = True) -> None:

@@ -8,8 +8,7 @@ import numpy as np
 
 from vstent.flow.case import Cells, FlowField, Level
 from vstent.geometry.surface import Surface
-from vstent.kernels import sampling as lattice_sampling
-from vstent.kernels import voxels
+from vstent.kernels import sampling as lattice_sampling, voxels
 from vstent.kernels.arrays import Bools, Floats, Ints
 
 CORNERS: Final = np.indices((2, 2, 2)).reshape(3, 8).T

@@ -315,18 +315,19 @@ class _Runs:
             return replace(field, advice=field.advice + why) if case.media else field
         similar, factor, size_mm = self.similar, 1.0, default_cell_size_mm(case)
         rounds: list[tuple[float, float, float]] = []
-        tile: calibration.Tile | None = None
         for number in range(runs - 1):
             steady = replace(calibration.scaled(case, factor), waveform=None)
             progress = self._part(number / runs, (number + 1) / runs)
             now = replace(self, engine=_engine_of(steady), prefix=f"round {number} ", progress=progress)
             similar = replace(now, similar=similar).answer(steady, start)
-            tile = tile or calibration.strongest(steady, similar)
-            rounds.append((factor, *calibration.read_off(steady, tile, similar, size_mm)))
+            if not rounds:
+                center_mm = calibration.strongest_mm(steady, similar)
+                walls = calibration.tile(steady, center_mm)
+            rounds.append((factor, *calibration.read_off(steady, walls, similar, size_mm, center_mm)))
             factor = calibration.next_factor(rounds)
-        last = replace(self, prefix="calibrated ", progress=self._part(1 - 1 / runs, 1.0))
-        if case.waveform is None:  # a pulse begins with a phase of the one before, which converges in fewer cycles
-            last = replace(last, similar=similar)
+        if case.waveform is not None:  # a pulse begins with a phase of the one before, and converges in fewer cycles
+            similar = self.similar
+        last = replace(self, prefix="calibrated ", progress=self._part(1 - 1 / runs, 1.0), similar=similar)
         field = last.answer(calibration.scaled(case, factor), start)
         remark = f"calibrated: it resists {factor:.3g} times as much."
         if all(of_screen == of_walls for _, of_screen, of_walls in rounds):

@@ -64,13 +64,11 @@ def write_centerlines(path: Path, centerlines: Sequence[Centerline]) -> None:
     )
 
 
-def write_cells(
-    path: Path, centers_mm: Floats, sizes_mm: Floats, cell_data: Arrays, point_data: Arrays = NOTHING
-) -> None:
+def write_cells(path: Path, centers_mm: Floats, sizes_mm: Floats, cell_data: Arrays) -> None:
     """Write cells of one or more regular grids as VTU: hexahedra with shared corners.
 
     Their centers (c, 3) are on grids aligned with the axes and with each other; their edges (c,) are multiples of the
-    smallest. There are arrays (c, ...) on the cells, and (p, ...) on the corners in the order of `grid_corners`.
+    smallest. There are arrays (c, ...) on the cells.
     """
     from vtkmodules.vtkCommonDataModel import VTK_HEXAHEDRON, vtkUnstructuredGrid
 
@@ -78,7 +76,7 @@ def write_cells(
     data = vtkUnstructuredGrid()
     data.SetPoints(_points(corners_mm))
     data.SetCells(VTK_HEXAHEDRON, _cells(cells.ravel(), np.arange(len(cells) + 1) * 8))
-    _write_xml(path, data, point_data, cell_data)
+    _write_xml(path, data, NOTHING, cell_data)
 
 
 def polydata_of(vertices_mm: Floats, faces: Ints) -> Any:

@@ -6,8 +6,7 @@ the command line appears at once.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from dataclasses import fields as fields_of
+from dataclasses import dataclass, fields as fields_of, replace
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
 

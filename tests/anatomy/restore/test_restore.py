@@ -12,6 +12,7 @@ from sac_truth import (
     anatomy_of,
     beside_the_fork_without_sac,
     moved_mm,
+    neck_center_mm,
     relative_errors,
     scanned_anatomy_of,
 )
@@ -77,7 +78,7 @@ def test_the_sac_has_its_volume_and_is_closed(demo) -> None:
     np.testing.assert_allclose(aneurysm.sac.volume_mm3, phantom.sac_volume_mm3, rtol=0.03)
     into_sac = phantom.sac.center_mm - aneurysm.neck.corners_mm.mean(axis=1)
     assert (np.einsum("ij,ij->i", into_sac, aneurysm.neck.normals) > 0).mean() > 0.99
-    foot = float(anatomy.parent.axis.nearest_abscissa_mm(phantom.neck_center_mm[None])[0])
+    foot = float(anatomy.parent.axis.nearest_abscissa_mm(neck_center_mm(phantom)[None])[0])
     proximal_mm, distal_mm = anatomy.parent.span_mm(aneurysm)
     assert proximal_mm < foot < distal_mm
 

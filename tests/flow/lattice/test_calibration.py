@@ -65,7 +65,7 @@ def test_a_screen_is_calibrated_to_what_stands_for_its_wires(
 ) -> None:
     """With a known screen in place of the walls: its flow is found from half and from twice its resistance."""
     known = with_numerics(braided, cell_size_mm=CELL_MM)
-    monkeypatch.setattr(calibration.Tile, "walls", lambda *_: known)
+    monkeypatch.setattr(calibration, "tile", lambda *_: known)
     wanted = found(simulate_case(known), known)
     begun = calibration.scaled(known, times)
     assert (np.abs(found(simulate_case(begun), begun) / wanted - 1) > 0.1)[:2].all()
@@ -79,7 +79,7 @@ def test_a_tile_has_the_walls_near_a_point_and_the_screen_elsewhere(braided: Flo
     case = with_numerics(braided, cell_size_mm=CELL_MM)
     assert case.ostium is not None
     center_mm = case.ostium.vertices_mm.mean(axis=0)
-    walls = calibration.tile_at(case, center_mm).walls(case)
+    walls = calibration.tile(case, center_mm)
     assert walls.wires is not None
     away_mm = np.linalg.norm(walls.wires.corners_mm.mean(axis=1) - center_mm, axis=1)
     assert away_mm.max() < calibration.TILE_MM + 0.05
@@ -190,10 +190,10 @@ def test_a_screen_whose_resistance_cannot_be_read_off_stays(braided: FlowCase, m
     """Of a tile that diverged, force and velocity are nan."""
     case = with_numerics(braided, cells_per_diameter=8.0, cells_across_neck=0.0, max_steps=100)
     screen = simulate_case(case)
-    tile = calibration.strongest(case, screen)
+    center_mm = calibration.strongest_mm(case, screen)
     for found_there in ((1.0, 0.5), (np.nan, np.nan)):
         monkeypatch.setattr(calibration, "_resistance", lambda *_, found_there=found_there: found_there)
-        rounds = [(1.0, *calibration.read_off(case, tile, screen, default_cell_size_mm(case)))]
+        rounds = [(1.0, *calibration.read_off(case, case, screen, default_cell_size_mm(case), center_mm))]
         assert calibration.next_factor(rounds) == 1.0
         assert calibration.next_factor([(0.8, 2.0, 1.5), (0.9, *rounds[0][1:])]) == 0.9
     assert "The screen is not calibrated: the force" in simulate_case(with_numerics(case, wires="calibrated")).advice

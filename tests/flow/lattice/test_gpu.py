@@ -20,9 +20,7 @@ from vstent.cli import main
 from vstent.errors import FlowError, InputError
 from vstent.flow import domain
 from vstent.flow.case import FlowCase, Sheet
-from vstent.flow.lattice import gpu as gpus
-from vstent.flow.lattice import state as lattice_state
-from vstent.flow.lattice import stepping
+from vstent.flow.lattice import gpu as gpus, state as lattice_state, stepping
 from vstent.flow.lattice.checkpoint import pack
 from vstent.flow.lattice.cost import GPU_BYTES_PER_CELL, estimate, refuse_too_large
 from vstent.flow.lattice.engine import LatticeBoltzmann, PulsatileLatticeBoltzmann

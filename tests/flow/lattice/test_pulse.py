@@ -10,11 +10,9 @@ from womersley import MEAN_MEAN_M_S, OMEGA, PULSE, RADIUS_M, SWING, womersley_m_
 from vstent import phantoms
 from vstent.anatomy.trace import trace
 from vstent.errors import InputError
-from vstent.flow import domain, sampling
-from vstent.flow import simulation as flow
+from vstent.flow import domain, sampling, simulation as flow
 from vstent.flow.case import PHASES, FlowField
-from vstent.flow.lattice import engine as lattice_engine
-from vstent.flow.lattice import pace as lattice_pace
+from vstent.flow.lattice import engine as lattice_engine, pace as lattice_pace
 from vstent.flow.lattice.pace import pace
 from vstent.flow.problem import vessel_case
 from vstent.flow.settings import FlowSettings, Numerics, Waveform

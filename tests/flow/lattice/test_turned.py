@@ -11,8 +11,7 @@ from vstent import phantoms
 from vstent.anatomy.trace import trace
 from vstent.deployment.deploy import deploy
 from vstent.devices.catalogue import find_design
-from vstent.flow import domain, sampling
-from vstent.flow import simulation as flows
+from vstent.flow import domain, sampling, simulation as flows
 from vstent.flow.case import FlowField
 from vstent.flow.convergence import turned
 from vstent.flow.problem import flow_case, vessel_case

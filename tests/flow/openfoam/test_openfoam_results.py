@@ -21,8 +21,7 @@ from vstent.flow import domain, sampling
 from vstent.flow.case import PHASES, Sheet, Target
 from vstent.flow.ends import Resistance, outflows
 from vstent.flow.engines import Outcome, Progress, run
-from vstent.flow.openfoam import folder as folders
-from vstent.flow.openfoam import program, results, scatter
+from vstent.flow.openfoam import folder as folders, program, results, scatter
 from vstent.flow.openfoam.bridge import Snapshot, bridge
 from vstent.flow.openfoam.dialects import Flavour
 from vstent.flow.openfoam.engine import OpenFoam, State

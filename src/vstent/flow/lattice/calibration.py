@@ -12,12 +12,11 @@ the blood nearly stands still in it, so that a sixth less resistance changes the
 from collections.abc import Sequence
 from dataclasses import replace
 from math import log
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
 from vstent.deployment.struts import part_of
-from vstent.devices.stent import Stent
 from vstent.flow import sampling
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.domain import default_cell_size_mm
@@ -50,8 +49,6 @@ SAMPLES: Final = 20_000
 RESPONSE: Final = 0.8
 """Power of the screen's resistance with which the ratio of force and velocity grows: where it is large, more blood goes
 through the edge of the averages (Silk, from half to the whole 0.81, from twice to the whole 0.77)."""
-LEAST_CHANGE: Final = 0.05
-"""Change of the logarithm of the factor from which on that power is read off two rounds."""
 LIKE_FLOW: Final = 0.9
 """Least correlation of force and velocity with which the resistance counts as known."""
 
@@ -63,42 +60,29 @@ def suits(case: FlowCase) -> bool:
     return all(one.normals.any() and np.median(one.spacing_mm) < WIDEST_PORES_MM for one in case.media)
 
 
-class Tile(NamedTuple):
-    """A piece of the device."""
-
-    center_mm: Floats
-    """(3,) its middle."""
-    solids: tuple[Stent, ...]
-    """Its wires."""
-
-    def walls(self, case: FlowCase) -> FlowCase:
-        """Return a case with these wires as walls."""
-        return replace(case, solids=self.solids, numerics=replace(case.numerics, wires="resolved"))
+def tile(case: FlowCase, center_mm: Floats) -> FlowCase:
+    """Return a case in which only the wires within `TILE_MM` of a point are walls."""
+    solids = (part_of(one, lengths(one.wire_points_mm - center_mm) < TILE_MM) for one in case.solids)
+    return replace(case, solids=tuple(solids), numerics=replace(case.numerics, wires="resolved"))
 
 
-def tile_at(case: FlowCase, center_mm: Floats) -> Tile:
-    """Return the wires of a case within `TILE_MM` of a point."""
-    return Tile(
-        center_mm,
-        tuple(part_of(one, lengths(one.wire_points_mm - center_mm) < TILE_MM) for one in case.solids),
-    )
-
-
-def strongest(case: FlowCase, flow: FlowField) -> Tile:
-    """Return the tile of the screen through which most blood passes in a flow, in the mean square."""
+def strongest_mm(case: FlowCase, flow: FlowField) -> Floats:
+    """Return the middle (3,) of the tile through which most blood passes in a flow, in the mean square."""
     points_mm, normals, area_mm2 = _samples(case)
     through_m_s = np.einsum("pd,pd->p", sampling.values_at(flow, points_mm)[0], normals)
     strength = nearby.sums(points_mm, points_mm, (area_mm2 * through_m_s**2)[:, None], TILE_MM)
-    return tile_at(case, points_mm[strength[:, 0].argmax()])
+    return np.asarray(points_mm[strength[:, 0].argmax()])
 
 
-def read_off(case: FlowCase, tile: Tile, flow: FlowField, cell_size_mm: float) -> tuple[float, float]:
-    """Return what the screen of a steady case and the wires of a tile resist to a flow, up to a common constant.
+def read_off(
+    case: FlowCase, walls: FlowCase, flow: FlowField, cell_size_mm: float, center_mm: Floats
+) -> tuple[float, float]:
+    """Return what the screen of a steady case and the walls of a tile resist to a flow, up to a common constant.
 
     Both are 1 where force and velocity are no measure of a resistance (see `LIKE_FLOW`).
     """
-    of_screen, _ = _resistance(case, flow, cell_size_mm, tile.center_mm)
-    of_walls, likeness = _resistance(tile.walls(case), flow, cell_size_mm, tile.center_mm)
+    of_screen, _ = _resistance(case, flow, cell_size_mm, center_mm)
+    of_walls, likeness = _resistance(replace(walls, media=case.media), flow, cell_size_mm, center_mm)
     return (of_screen, of_walls) if likeness > LIKE_FLOW and min(of_screen, of_walls) > 0 else (1.0, 1.0)
 
 
@@ -106,7 +90,7 @@ def next_factor(rounds: Sequence[tuple[float, float, float]]) -> float:
     """Return the factor on a screen after rounds (factor, of screen, of walls), by the secant of their logarithms."""
     factor, of_screen, of_walls = rounds[-1]
     response = RESPONSE
-    if len(rounds) > 1 and abs(log(factor / rounds[-2][0])) > LEAST_CHANGE:
+    if len(rounds) > 1 and factor != rounds[-2][0]:
         response = min(max(log(of_screen / rounds[-2][1]) / log(factor / rounds[-2][0]), 0.5), 1.0)
     return float(factor * (of_walls / of_screen) ** (1 / response))
 
@@ -121,7 +105,7 @@ def scaled(case: FlowCase, factor: float) -> FlowCase:
 def cost(case: FlowCase) -> tuple[float, float]:
     """Estimate the run time, s, of all tiles of a case, and the peak memory, bytes, of one."""
     assert case.ostium is not None
-    walls, size_mm = tile_at(case, case.ostium.vertices_mm.mean(axis=0)).walls(case), default_cell_size_mm(case)
+    walls, size_mm = tile(case, case.ostium.vertices_mm.mean(axis=0)), default_cell_size_mm(case)
     step_s = longest_step_s(case, sizes_mm(walls, size_mm)[-1], peak_speed_m_s(case, None))
     return ROUNDS * seconds_of(walls, size_mm, settling_s(case) / step_s), memory_bytes(walls)
 
@@ -135,8 +119,7 @@ def settling_s(case: FlowCase) -> float:
 def _samples(case: FlowCase) -> tuple[Floats, Floats, Floats]:
     """Return samples (p, 3) of the screen in the ostium, their normals (p, 3) and areas (p,)."""
     assert case.ostium is not None
-    parts = [np.column_stack([one.points_mm, one.normals, one.area_mm2]) for one in case.media]
-    found = np.concatenate(parts)
+    found = np.concatenate([np.column_stack([one.points_mm, one.normals, one.area_mm2]) for one in case.media])
     found = found[case.ostium.closest(found[:, :3])[1] < REACH_MM]
     found = found[:: max(1, len(found) // SAMPLES)]
     return found[:, :3], found[:, 3:6], found[:, 6]

@@ -76,8 +76,7 @@ class Cost:
 def estimate(case: FlowCase) -> Cost:
     """Estimate the cost of a flow from the vessel's volume and the speed measured on this machine."""
     cell_size_mm = default_cell_size_mm(case)
-    cells, memory_bytes = _size(case, cell_size_mm)
-    steps = _steps(case, cell_size_mm)
+    (cells, memory_bytes), steps = _size(case, cell_size_mm), _steps(case, cell_size_mm)
     return Cost(cell_size_mm, round(cells), round(memory_bytes), steps, seconds_of(case, cell_size_mm, steps))
 
 

@@ -11,8 +11,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from vstent.flow.lattice.kernels import d3q19
-from vstent.flow.lattice.kernels import gpu as kernels
+from vstent.flow.lattice.kernels import d3q19, gpu as kernels
 from vstent.flow.lattice.setup import Addressing, Links
 from vstent.flow.lattice.state import State
 from vstent.kernels.arrays import Floats, Ints

@@ -12,8 +12,7 @@ from numba import cuda
 from numpy.typing import NDArray
 
 from vstent.flow.lattice.gpu_tables import PAIRS, START, correction_of, joined, layout_of, rates_of, tables_of
-from vstent.flow.lattice.kernels import d3q19
-from vstent.flow.lattice.kernels import gpu as kernels
+from vstent.flow.lattice.kernels import d3q19, gpu as kernels
 from vstent.flow.lattice.kernels.gpu import THREADS
 from vstent.flow.lattice.recording import NotRecordedError, Pairs, plan, recorded
 from vstent.flow.lattice.state import DEFER_PAIRS, DEFER_PART, State

@@ -4,23 +4,17 @@ Sheets that share a cell add as tensors: sheet k resists the velocity u of the c
 normal and with b_k (u - (u.n_k) n_k) across it, and its inertial loss is added. A cell stores one axis with a
 resistance along and across it. The axis is that of the normals: the one that they share, or the line along which two
 sheets meet if they cross at more than 70 degrees. The resistances are those of the summed tensor along this axis, and
-its mean across it. This is exact for parallel sheets and for equal ones that meet at a right angle. In between a cell
-on the line where two sheets meet is off by at most 14 % where a and b differ by a factor of two. Blood that passes two
-planes crossing every 16 cells is 6 % too fast where the tensor is exact and 6 to 9 % where it is not: six coefficients
-would gain little.
+its mean across it. This is exact for parallel sheets and for equal ones that meet at a right angle. In between, blood
+that passes two planes crossing every 16 cells is up to 9 instead of 6 % too fast: six coefficients would gain little.
 
-`GridResistance.spread_Pa_s_m` is the mean of the sheets, weighted by their tangential resistance. Two sheets within a
-cell of each other are spread over the same layers, and the velocity along them behind both is then less certain than
-behind one: within 15 % for 60 Pa s/m each, and 40 % too low (both at the same place) to 60 % too high (half a cell
-apart) for 380. From two cells apart on each acts as alone (`tests/flow/test_screen_sheet.py`).
+`GridResistance.spread_Pa_s_m` is the mean of the sheets, weighted by their tangential resistance. The velocity along
+two sheets within a cell of each other is within 15 % behind them for 60 Pa s/m each, and -40 to +60 % off for 380. From
+two cells apart on each acts as alone (`tests/flow/test_screen_sheet.py`).
 
 A region, in which coils resist alike in all directions, has the normal 0. Where it shares a cell with a sheet, its
 inertial loss is right along the sheet's normal and half as large across it, because a cell stores one coefficient.
 
-Two like meshes (wires of 0.03 mm, 0.25 mm apart) resist 1.9 to 2.1 times as much as one where 0.1 mm lies between them,
-and 1.5 (wires in line) to 2.9 times (staggered) where they touch, which is 2.0 for blood that has either way, at pore
-Reynolds numbers of 0.1 and 10. Along them as much blood passes as along two solid plates, within 5 %
-(`benchmarks/meshes.py`). The sum of both is therefore used.
+Two like meshes resist twice as much as one, also where they touch (`benchmarks/meshes.py`): their sum is used.
 """
 
 from collections.abc import Sequence

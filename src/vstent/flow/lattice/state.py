@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from vstent.flow import domain as domains
-from vstent.flow import sampling
+from vstent.flow import domain as domains, sampling
 from vstent.flow.case import FlowCase
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.levels import Interface

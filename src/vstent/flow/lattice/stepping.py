@@ -11,9 +11,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from vstent.flow import domain as domains
-from vstent.flow import sampling
-from vstent.flow.case import Cells, FlowCase, FlowField
+from vstent.flow import domain as domains, sampling
+from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.ends import outflows
 from vstent.flow.lattice.gpu import require_gpu, told
 from vstent.flow.lattice.kernels import d3q19, exchange
@@ -500,10 +499,6 @@ def monitored(state: State, now: Sequence[Snapshot]) -> Floats:
     values = [in_sac.mean(), now[0].pressure_Pa[inlet].mean(), now[0].speed_m_s.mean()]
     if state.neck:
         parts = zip(state.levels, now, state.neck, strict=True)
-        values.append(sum(_inflow_mL_s(level.domain, one.velocity_m_s, *at) for level, one, at in parts))
+        through = (sampling.read_through_mL_s(a.domain, b.velocity_m_s.astype(float), *at) for a, b, at in parts)
+        values.append(sum(map(sampling.inflow_mL_s, through)))
     return np.array(values, dtype=float)
-
-
-def _inflow_mL_s(grid: Cells, velocity_m_s: NDArray[np.float32], places: Floats, area_mm2: Floats) -> float:
-    """Return the flow rate in through points (p, 3) on a level, in its grid units."""
-    return sampling.inflow_mL_s(sampling.read_through_mL_s(grid, velocity_m_s.astype(float), places, area_mm2))

@@ -10,8 +10,7 @@ from scipy.sparse import csr_matrix
 from vstent.flow import sampling
 from vstent.flow.case import FlowCase
 from vstent.flow.domain import Domain
-from vstent.flow.openfoam import folder as folders
-from vstent.flow.openfoam import results, scatter
+from vstent.flow.openfoam import folder as folders, results, scatter
 from vstent.flow.openfoam.mesh import STRUTS
 from vstent.kernels.arrays import Floats
 from vstent.units import M_PER_MM

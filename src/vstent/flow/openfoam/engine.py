@@ -17,8 +17,7 @@ from vstent.flow import domain as domains
 from vstent.flow.case import PHASES, FlowCase, FlowField, Level, Phase
 from vstent.flow.ends import outflows
 from vstent.flow.engines import AbstractEngine, Outcome, Saved
-from vstent.flow.openfoam import folder as folders
-from vstent.flow.openfoam import program, results
+from vstent.flow.openfoam import folder as folders, program, results
 from vstent.flow.openfoam.boundary import cycle_s, flow_table, table_name
 from vstent.flow.openfoam.bridge import Bridge, Snapshot, bridge, read
 from vstent.flow.openfoam.case import foam_case, strut_solids
