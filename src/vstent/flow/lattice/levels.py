@@ -84,8 +84,6 @@ CHUNK: Final = 10_000
 """Number of cells whose stencils are computed at once."""
 MOST_PUSHED: Final = 0.03
 """Largest momentum that is added at a border, over that of the cells that are set."""
-AROUND: Final = np.indices((4, 4, 4)).reshape(3, -1).T - 1
-"""Places of the 64 cells of a stencil relative to the first of its middle cells."""
 REACH: Final = 1.2
 """Standard deviation in cells of the weights of a fit beside a wall."""
 RIDGE: Final = 1e-3
@@ -98,22 +96,20 @@ class Stencil:
 
     place: Ints
     """(c,) storage places of the cells read."""
-    block: Ints
-    """(b, 64) numbers, among these cells, of 4 x 4 x 4 cells, between whose middle ones lie eight target cells each."""
     start: Ints
-    """(n + 1,) first entry of each further target cell."""
+    """(n + 1,) first entry of each target cell."""
     cell: Ints
     """(e,) number, among these cells, of the one read."""
     weight: NDArray[np.float32]
     """(e, 2) weights of the even and of the odd part of the populations."""
     target: Ints
-    """(8 b + n,) storage places of the target cells, those in blocks first."""
+    """(n,) storage places of the target cells."""
     limit: NDArray[np.float32]
-    """(8 b + n,) largest grid Reynolds number there (see `setup.thickest`)."""
+    """(n,) largest grid Reynolds number there (see `setup.thickest`)."""
     group: Ints
-    """(8 b + n,) group of each of them."""
+    """(n,) group of each of them."""
     share: NDArray[np.float32]
-    """(8 b + n, 3) what it gets of the momentum added to its group normal to the border, in proportion to the wall
+    """(n, 3) what it gets of the momentum added to its group normal to the border, in proportion to the wall
     distance."""
 
 
@@ -462,22 +458,18 @@ def stencil(read: Grid, written: Grid, target: Ints, group: Ints, share: Floats)
 
     Those with no cell of the first grid near them are left out.
     """
-    corners, order = _blocks(read.domain, written.domain, target)
-    target, group, share = target[order], group[order], share[order]
-    block, first = _cells_around(read.domain, corners), 8 * len(corners)
-    pieces = np.split(target[first:], np.arange(CHUNK, len(target) - first, CHUNK))
+    pieces = np.split(target, np.arange(CHUNK, len(target), CHUNK))
     parts = [_weights(read.domain, written.domain, piece) for piece in pieces]
     counts, cell = (np.concatenate([part[k] for part in parts]) for k in range(2))
     weight = np.concatenate([part[2] for part in parts])
-    is_near = np.r_[np.ones(first, dtype=bool), counts > 0]
+    is_near = counts > 0
     target, group, share = target[is_near], group[is_near], share[is_near]
     is_read = np.zeros(len(read.domain.cells), dtype=bool)
-    is_read[cell] = is_read[block] = True
+    is_read[cell] = True
     number = np.cumsum(is_read, dtype=np.int32) - 1
     return Stencil(
         read.addressing.place[is_read],
-        number[block],
-        np.r_[0, np.cumsum(counts[counts > 0])].astype(np.int32),
+        np.r_[0, np.cumsum(counts[is_near])].astype(np.int32),
         number[cell],
         weight,
         written.addressing.place[target],
@@ -487,59 +479,27 @@ def stencil(read: Grid, written: Grid, target: Ints, group: Ints, share: Floats)
     )
 
 
-def _cells_around(source: Domain, corner: Ints) -> Ints:
-    """Return the cells (m, 64) around grid points (m, 3), which are the first of the two middle ones on every axis."""
-    index = np.pad(source.index, 4, constant_values=-1)
-    limit: Ints = np.array(index.shape) - 1
-    return index[tuple(np.moveaxis(np.clip(corner[:, None] + AROUND + 4, 0, limit), -1, 0))]
-
-
-def _is_whole(source: Domain, cell: Ints) -> Bools:
-    """Return whether cells (m, 64) are all blood without a septum."""
-    of_septa = np.zeros(len(source.cells) + 1, dtype=bool)
-    of_septa[source.septum_cell] = True
-    return np.asarray(((cell >= 0) & ~of_septa[cell]).all(axis=1))
-
-
-def _cubic(t: Floats) -> Floats:
-    """Return the weights (m, 64) of Lagrange's cubic polynomials at places t (m, 3) between the middle cells."""
-    nodes = np.array([-1, 0, 1, 2])
-    others = np.array([[0, 1, 2], [-1, 1, 2], [-1, 0, 2], [-1, 0, 1]])
-    cubic = (t[..., None, None] - others).prod(axis=3) / (nodes[:, None] - others).prod(axis=1)
-    return np.einsum("ma,mb,mc->mabc", cubic[:, 0], cubic[:, 1], cubic[:, 2]).reshape(len(t), -1)
-
-
-def in_block() -> NDArray[np.float32]:
-    """Return the weights (2, 64, 4) with which the first and last four target cells of a block read (see `Stencil`)."""
-    weight = _cubic(np.indices((WIDTH,) * 3).reshape(3, -1).T / WIDTH + 0.5 / WIDTH)
-    return np.ascontiguousarray(weight.reshape(2, 4, -1).transpose(0, 2, 1), dtype=np.float32)
-
-
-def _blocks(source: Domain, other: Domain, target: Ints) -> tuple[Ints, Ints]:
-    """Return the corners (b, 3) of blocks of `source` with eight target cells (n,), and an order (n,) of the targets.
-
-    It begins with those in blocks, block by block. On a coarser grid there are none.
-    """
-    at = source.places(other.centers_mm[target])
-    corner = np.floor(at).astype(int)
-    corners, of_target, count = np.unique(corner, axis=0, return_inverse=True, return_counts=True)
-    found = np.flatnonzero(count == WIDTH**3)
-    found = found[_is_whole(source, _cells_around(source, corners[found]))]
-    rank = np.full(len(corners), len(corners))
-    rank[found] = np.arange(len(found))
-    return corners[found], np.lexsort((*(at - corner).T[::-1], rank[of_target.ravel()]))
-
-
 def _weights(source: Domain, other: Domain, target: Ints) -> tuple[Ints, Ints, NDArray[np.float32]]:
     """Return the number (m,) of cells of `source` read for each cell `target` of another grid, them, and weights."""
     at = source.places(other.centers_mm[target])
     corner = np.floor(at).astype(int)
-    cell = _cells_around(source, corner)
-    even = _cubic(at - corner)
+    offset = np.indices((4, 4, 4)).reshape(3, -1).T - 1
+    around = corner[:, None] + offset
+    index = np.pad(source.index, 4, constant_values=-1)
+    limit: Ints = np.array(index.shape) - 1
+    cell = index[tuple(np.moveaxis(np.clip(around + 4, 0, limit), -1, 0))]
+    of_septa = np.zeros(len(source.cells) + 1, dtype=bool)
+    of_septa[source.septum_cell] = True
+    is_whole = ((cell >= 0) & ~of_septa[cell]).all(axis=1)
+    t = (at - corner)[..., None]
+    nodes = np.array([-1, 0, 1, 2])
+    others = np.array([[0, 1, 2], [-1, 1, 2], [-1, 0, 2], [-1, 0, 1]])
+    cubic = (t[..., None] - others).prod(axis=3) / (nodes[:, None] - others).prod(axis=1)  # Lagrange's polynomials
+    even = np.einsum("ma,mb,mc->mabc", cubic[:, 0], cubic[:, 1], cubic[:, 2]).reshape(len(at), -1)
     odd = even.copy()
-    beside = np.flatnonzero(~_is_whole(source, cell))
+    beside = np.flatnonzero(~is_whole)
     if len(beside):
-        away = AROUND - (at - corner)[beside][:, None]
+        away = offset - (at - corner)[beside][:, None]
         even[beside], odd[beside] = _beside_wall(source, other, target[beside], cell[beside], away)
     is_used = (cell >= 0) & (even != 0)
     weight = np.stack([even[is_used], odd[is_used]], axis=1).astype(np.float32)

@@ -27,7 +27,6 @@ from vstent.flow.lattice.levels import (
     Interface,
     Stencil,
     beside_walls,
-    in_block,
     refined,
     sizes_mm,
 )
@@ -52,8 +51,6 @@ LEARNED: Final = 2
 """Number of harmonics of a pulse for which the delay of an outlet is corrected: cycles that correct more converge
 slowly."""
 
-IN_BLOCK: Final = in_block()
-"""Weights of the target cells in a block (see `exchange.carry`)."""
 _GRIDS: WeakKeyDictionary[Vessel, dict[tuple[Any, ...], list[tuple[Grid, Interface | None]]]] = WeakKeyDictionary()
 """Grids by grid spacing, refined part and resolved wires, as long as the vessel exists."""
 
@@ -433,7 +430,7 @@ def _carry(source: State, target: State, along: Stencil, push: Floats, ratio: fl
     scales, rates = source.scales, (np.float32(source.scales.odd_rate), np.float32(target.scales.odd_rate))
     numbers = np.float32(ratio), np.float32(scales.relaxation_steps), scales.thinning, *rates
     into = target.populations, target.addressing.stride, along.target, along.limit
-    read = along.place, along.block, IN_BLOCK, along.start, along.cell, along.weight, along.group, along.share
+    read = along.place, along.start, along.cell, along.weight, along.group, along.share
     exchange.carry(source.populations, source.addressing.stride, read, push, into, numbers)
 
 

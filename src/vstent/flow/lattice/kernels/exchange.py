@@ -52,94 +52,53 @@ def _plus_two(total: Any, weight: float, values: Any) -> Any:
 _plus: Final = njit(cache=True, forceinline=True)(_plus_one if len(_STARTS) == 1 else _plus_two)
 
 
-@njit(cache=True, forceinline=True, fastmath=True, error_model="numpy")
-def _four(read: Any, cells: Any, weights: Any, values: Any) -> None:
-    """Write the values (4, `_VALUES`) of four target cells that read the same cells (m,) with weights (m, 4)."""
-    zero = lanes.gather(read, _STARTS, len(read) - _VALUES)
-    even, even1, even2, even3, odd, odd1, odd2, odd3 = zero, zero, zero, zero, zero, zero, zero, zero
-    for n in range(len(cells)):
-        at, weight = cells[n] * _VALUES, weights[n]
-        of_even, of_odd = lanes.gather(read, _STARTS, at), lanes.gather(read, _STARTS, at + _EVEN)
-        even, odd = _plus(even, weight[0], of_even), _plus(odd, weight[0], of_odd)
-        even1, odd1 = _plus(even1, weight[1], of_even), _plus(odd1, weight[1], of_odd)
-        even2, odd2 = _plus(even2, weight[2], of_even), _plus(odd2, weight[2], of_odd)
-        even3, odd3 = _plus(even3, weight[3], of_even), _plus(odd3, weight[3], of_odd)
-    _write(values[0], even, odd)
-    _write(values[1], even1, odd1)
-    _write(values[2], even2, odd2)
-    _write(values[3], even3, odd3)
-
-
-@njit(cache=True, forceinline=True)
-def _write(values: Any, even: Any, odd: Any) -> None:
-    """Write both parts of the values of a cell."""
-    lanes.scatter(values, _STARTS, 0, even, lanes.COUNT)
-    lanes.scatter(values, _STARTS, _EVEN, odd, lanes.COUNT)
-
-
-@njit(cache=True, forceinline=True, fastmath=True, error_model="numpy")
-def _set(i: int, values: Any, held: Any, stencil: Any, push: Any, into: Any, numbers: Any) -> None:
-    """Set target cell `i` from its interpolated values; `held` (19,) is overwritten (see `carry` for the rest)."""
-    group, part = stencil
-    g, new_stride, new_place, limit = into
-    ratio, time, law, odd_rate, new_odd_rate = numbers
-    held[0] = values[0]
-    x, y, z = part[i]
-    for k in range(9):
-        c = _AXES[2 * k + 1]
-        along = push[group[i]] * (c[0] * x + c[1] * y + c[2] * z) / (6.0 if k < 3 else 12.0)
-        odd = values[_EVEN + k] + np.float32(along)
-        held[2 * k + 1], held[2 * k + 2] = values[1 + k] + odd, values[1 + k] - odd
-    old_time = time
-    if law[0] > 0.0:
-        old_time = np.float32(thinned(stress_size(held), time, law))
-    new_time = _HALF + (old_time - _HALF) / ratio
-    squares = values[10], values[11], values[12], values[13], values[14], values[15]
-    new = carried(held, squares, ratio, (old_time, limit[i], odd_rate), (new_time, limit[i], new_odd_rate))
-    for q in range(19):
-        g[OPPOSITE[q] * new_stride + new_place[i]] = new[q]
-
-
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
 def carry(f: Any, stride: int, stencil: Any, push: Any, into: Any, numbers: Any) -> None:
     """Set populations of a grid by interpolation from those of another (see `collision.carried`).
 
-    The first target cells are those in the eight places between the middle cells of a block of source cells, block by
-    block; they share what is read.
-
     Parameters
     ----------
     f, stride : populations of the source and distance between two of a cell.
-    stencil : tuple; (c,) int32 storage places of the source cells read, (b, 64) int32 numbers of those in a block,
-        (2, 64, 4) float32 their weights for the target cells in it; of every further target cell its first entry
-        (n + 1,) int32, (e,) int32 number of a source cell, (e, 2) float32 its weight for the even and for the odd part
-        of the populations; (8 b + n,) int32 group of every target cell, and (8 b + n, 3) float32 its part in the
-        momentum of its group.
+    stencil : tuple; (c,) int32 storage places of the source cells read, (n + 1,) int32 first entry of every target
+        cell, (e,) int32 number of a source cell, (e, 2) float32 its weight for the even and for the odd part of the
+        populations, (n,) int32 group of every target cell, and (n, 3) float32 its part in the momentum of
+        its group.
     push : (g,) momentum added to the cells of every group.
-    into : tuple; populations and stride of the target, int32 storage place of every target cell, and float32 largest
-        grid Reynolds number there.
+    into : tuple; populations and stride of the target, (n,) int32 storage place of every target cell, and (n,) float32
+        largest grid Reynolds number there.
     numbers : tuple of float32; ratio of the spacing of the target to that of the source, relaxation time of the source,
         its (4,) Carreau-Yasuda law, and relaxation rates of the odd part on the source and on the target.
     """
-    place, block, shared, start, cell, weight, group, part = stencil
+    place, start, cell, weight, group, part = stencil
+    g, new_stride, new_place, limit = into
+    ratio, time, law, odd_rate, new_odd_rate = numbers
     read = np.zeros((len(place) + 1) * _VALUES, np.float32)
     for c in prange(len(place)):
         _split(f, stride, place[c], read[c * _VALUES : (c + 1) * _VALUES])
-    for b in prange(len(block)):
-        four, held = np.zeros((4, _VALUES), np.float32), np.zeros(19, np.float32)
-        for half in range(2):
-            _four(read, block[b], shared[half], four)
-            for k in range(4):
-                _set(8 * b + 4 * half + k, four[k], held, (group, part), push, into, numbers)
-    for i in prange(len(start) - 1):
+    for i in prange(len(new_place)):
         values, held = np.zeros(_VALUES, np.float32), np.zeros(19, np.float32)
-        even = odd = lanes.gather(read, _STARTS, len(place) * _VALUES)  # zeros
+        even = odd_part = lanes.gather(read, _STARTS, len(place) * _VALUES)  # zeros
         for e in range(start[i], start[i + 1]):
             at = cell[e] * _VALUES
             even = _plus(even, weight[e, 0], lanes.gather(read, _STARTS, at))
-            odd = _plus(odd, weight[e, 1], lanes.gather(read, _STARTS, at + _EVEN))
-        _write(values, even, odd)
-        _set(8 * len(block) + i, values, held, (group, part), push, into, numbers)
+            odd_part = _plus(odd_part, weight[e, 1], lanes.gather(read, _STARTS, at + _EVEN))
+        lanes.scatter(values, _STARTS, 0, even, lanes.COUNT)
+        lanes.scatter(values, _STARTS, _EVEN, odd_part, lanes.COUNT)
+        held[0] = values[0]
+        x, y, z = part[i]
+        for k in range(9):
+            c = _AXES[2 * k + 1]
+            along = push[group[i]] * (c[0] * x + c[1] * y + c[2] * z) / (6.0 if k < 3 else 12.0)
+            odd = values[_EVEN + k] + np.float32(along)
+            held[2 * k + 1], held[2 * k + 2] = values[1 + k] + odd, values[1 + k] - odd
+        old_time = time
+        if law[0] > 0.0:
+            old_time = np.float32(thinned(stress_size(held), time, law))
+        new_time = _HALF + (old_time - _HALF) / ratio
+        squares = values[10], values[11], values[12], values[13], values[14], values[15]
+        new = carried(held, squares, ratio, (old_time, limit[i], odd_rate), (new_time, limit[i], new_odd_rate))
+        for q in range(19):
+            g[OPPOSITE[q] * new_stride + new_place[i]] = new[q]
 
 
 @njit(cache=True, parallel=True)
