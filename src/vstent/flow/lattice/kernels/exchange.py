@@ -19,6 +19,8 @@ _EVEN: Final = 16
 """Number of values per cell that are interpolated with the weights of the even part: those before the odd part."""
 _VALUES: Final = 2 * _EVEN
 """Number of values per cell: rest population, half sums of pairs (9), products u u (6), half differences (9), zeros."""
+_CHUNK: Final = 256
+"""Number of target cells for which a thread uses the same scratch memory."""
 _STARTS: Final = tuple(range(0, _EVEN, lanes.COUNT))
 """First of the values in each vector register that holds those of either part."""
 
@@ -75,30 +77,31 @@ def carry(f: Any, stride: int, stencil: Any, push: Any, into: Any, numbers: Any)
     read = np.zeros((len(place) + 1) * _VALUES, np.float32)
     for c in prange(len(place)):
         _split(f, stride, place[c], read[c * _VALUES : (c + 1) * _VALUES])
-    for i in prange(len(new_place)):
+    for chunk in prange((len(new_place) + _CHUNK - 1) // _CHUNK):
         values, held = np.zeros(_VALUES, np.float32), np.zeros(19, np.float32)
-        even = odd_part = lanes.gather(read, _STARTS, len(place) * _VALUES)  # zeros
-        for e in range(start[i], start[i + 1]):
-            at = cell[e] * _VALUES
-            even = _plus(even, weight[e, 0], lanes.gather(read, _STARTS, at))
-            odd_part = _plus(odd_part, weight[e, 1], lanes.gather(read, _STARTS, at + _EVEN))
-        lanes.scatter(values, _STARTS, 0, even, lanes.COUNT)
-        lanes.scatter(values, _STARTS, _EVEN, odd_part, lanes.COUNT)
-        held[0] = values[0]
-        x, y, z = part[i]
-        for k in range(9):
-            c = _AXES[2 * k + 1]
-            along = push[group[i]] * (c[0] * x + c[1] * y + c[2] * z) / (6.0 if k < 3 else 12.0)
-            odd = values[_EVEN + k] + np.float32(along)
-            held[2 * k + 1], held[2 * k + 2] = values[1 + k] + odd, values[1 + k] - odd
-        old_time = time
-        if law[0] > 0.0:
-            old_time = np.float32(thinned(stress_size(held), time, law))
-        new_time = _HALF + (old_time - _HALF) / ratio
-        squares = values[10], values[11], values[12], values[13], values[14], values[15]
-        new = carried(held, squares, ratio, (old_time, limit[i], odd_rate), (new_time, limit[i], new_odd_rate))
-        for q in range(19):
-            g[OPPOSITE[q] * new_stride + new_place[i]] = new[q]
+        for i in range(_CHUNK * chunk, min(_CHUNK * chunk + _CHUNK, len(new_place))):
+            even = odd_part = lanes.gather(read, _STARTS, len(place) * _VALUES)  # zeros
+            for e in range(start[i], start[i + 1]):
+                at = cell[e] * _VALUES
+                even = _plus(even, weight[e, 0], lanes.gather(read, _STARTS, at))
+                odd_part = _plus(odd_part, weight[e, 1], lanes.gather(read, _STARTS, at + _EVEN))
+            lanes.scatter(values, _STARTS, 0, even, lanes.COUNT)
+            lanes.scatter(values, _STARTS, _EVEN, odd_part, lanes.COUNT)
+            held[0] = values[0]
+            x, y, z = part[i]
+            for k in range(9):
+                c = _AXES[2 * k + 1]
+                along = push[group[i]] * (c[0] * x + c[1] * y + c[2] * z) / (6.0 if k < 3 else 12.0)
+                odd = values[_EVEN + k] + np.float32(along)
+                held[2 * k + 1], held[2 * k + 2] = values[1 + k] + odd, values[1 + k] - odd
+            old_time = time
+            if law[0] > 0.0:
+                old_time = np.float32(thinned(stress_size(held), time, law))
+            new_time = _HALF + (old_time - _HALF) / ratio
+            squares = values[10], values[11], values[12], values[13], values[14], values[15]
+            new = carried(held, squares, ratio, (old_time, limit[i], odd_rate), (new_time, limit[i], new_odd_rate))
+            for q in range(19):
+                g[OPPOSITE[q] * new_stride + new_place[i]] = new[q]
 
 
 @njit(cache=True, parallel=True)
