@@ -158,7 +158,7 @@ ALL = Settings(
         95.0,
         0.7,
         0.4,
-        Numerics(0.2, True, "resolved", 20.0, 1e5, 0.02, 9000, 3, 0.03, 0.1, "openfoam", 2, True),
+        Numerics(0.2, True, "resolved", 20.0, 40.0, 1e5, 0.02, 9000, 3, 0.03, 0.1, "openfoam", 2, True),
     ),
     Ranges(7, 2, 0.1, 0.2, 0.3, 0.4, 0.5),
     "six_months",

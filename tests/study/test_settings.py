@@ -31,6 +31,7 @@ NO_OPTION = {
     "treatments.implants.placing.anchor": "the middle; the page and Python set it",
     "treatments.implants.placing.shift_mm": IN_TEXT,
     "flow.numerics.cells_per_diameter": OF_METHOD,
+    "flow.numerics.cells_across_neck": OF_METHOD,
     "flow.numerics.cell_budget": OF_METHOD,
     "flow.numerics.tolerance": OF_METHOD,
     "flow.numerics.max_steps": OF_METHOD,

@@ -1,6 +1,7 @@
 """The screen of a braid, calibrated on wires that are walls in a piece of the neck, and finer around a narrow neck."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -65,7 +66,13 @@ def test_a_screen_is_calibrated_to_what_stands_for_its_wires(
 ) -> None:
     """With a known screen in place of the walls: its flow is found from half and from twice its resistance."""
     known = with_numerics(braided, cell_size_mm=CELL_MM)
-    monkeypatch.setattr(calibration, "tile", lambda *_: known)
+    real = calibration._resistance
+
+    def resistance(case: FlowCase, *of_tile: Any) -> tuple[float, float]:
+        return real(known if case.numerics.wires == "resolved" else case, *of_tile)
+
+    monkeypatch.setattr(calibration, "tile", lambda case, _: with_numerics(case, wires="resolved"))
+    monkeypatch.setattr(calibration, "_resistance", resistance)
     wanted = found(simulate_case(known), known)
     begun = calibration.scaled(known, times)
     assert (np.abs(found(simulate_case(begun), begun) / wanted - 1) > 0.1)[:2].all()

@@ -47,7 +47,7 @@ from dataclasses import replace
 from pathlib import Path
 import numpy as np
 from vstent.flow.lattice.checkpoint import pack
-from vstent.flow.lattice.stepping import _read_here, advance, step
+from vstent.flow.lattice.stepping import read_here, advance, step
 
 state, twin = (pickle.loads(Path(sys.argv[1]).read_bytes()) for _ in range(2))
 assert "vstent.flow.lattice.kernels.gpu" not in sys.modules  # who did not ask for a GPU does not load what it takes
@@ -62,7 +62,7 @@ saved = pack(state)
 assert state.device is not None  # the next steps are longer: it has converted what it holds
 advance(state, 0)
 saved_again = pack(state)
-for found, wanted in zip(state.device.read()[:2], _read_here(state)[:2]):
+for found, wanted in zip(state.device.read()[:2], read_here(state)[:2]):
     np.testing.assert_array_equal(found, wanted)
 for name in saved:
     np.testing.assert_array_equal(saved_again[name], saved[name])
