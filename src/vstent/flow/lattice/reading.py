@@ -23,7 +23,7 @@ from vstent.kernels.directions import VELOCITIES
 
 FEWEST_ACROSS_NECK: Final = 25
 """Number of cells across a neck with a screen below which a flow says so. 13, 21, 27 and 38 cells give Silk over a neck
-of 2.7 mm 36, 15, 8 and 4 % more neck inflow and 35, 20, 12 and 6 % more velocity in the sac than wires as walls."""
+of 2.7 mm 37, 16, 9 and 4 % more neck inflow and 37, 21, 13 and 7 % more velocity in the sac than wires as walls."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -148,7 +148,8 @@ def _grids(case: FlowCase, cell_size_mm: float) -> list[tuple[Grid, Interface | 
     sizes = sizes_mm(case, cell_size_mm)
     coarsest_mm, finest_mm = sizes[0], sizes[-1]
     are_walls = domains.wires_of(case, finest_mm) is not None
-    key = sizes, case.sac if len(sizes) > 1 else None, case.solids if are_walls else ()
+    part = (case.sac, case.numerics.close_up) if len(sizes) > 1 else None
+    key = sizes, part, case.solids if are_walls else ()
     if key not in built:
         for of_walls in [other for other in built if other[2]]:  # of another device, or of another tile of it
             del built[of_walls]
