@@ -5,13 +5,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from small_neck import covered
 
 import vstent
-from vstent import phantoms
-from vstent.anatomy.restore.restore import restore
-from vstent.anatomy.trace import trace
-from vstent.anatomy.trim import trim
-from vstent.deployment.struts import is_over_restored
 from vstent.flow import simulation
 from vstent.flow.case import PHASES, FlowCase, FlowField
 from vstent.flow.domain import default_cell_size_mm
@@ -21,11 +17,9 @@ from vstent.flow.lattice.cost import estimate
 from vstent.flow.lattice.engine import LatticeBoltzmann, PulsatileLatticeBoltzmann
 from vstent.flow.lattice.levels import sizes_mm
 from vstent.flow.lattice.state import State
-from vstent.flow.problem import flow_case
 from vstent.flow.settings import FlowSettings, Numerics
 from vstent.flow.simulation import simulate_case
 from vstent.flow.waveform import Waveform
-from vstent.geometry.vessel import Vessel
 from vstent.kernels.arrays import Floats
 from vstent.units import duration
 
@@ -36,19 +30,7 @@ INDICES = ("neck_inflow_mL_s", "mean_sac_velocity_m_s", "mean_sac_wss_Pa")
 @pytest.fixture(scope="module")
 def braided() -> FlowCase:
     """A short tube with a sac, and the part of a braid that lies over its neck."""
-    tube = phantoms.with_sac(
-        phantoms.tube(length_mm=24.0, radius_mm=1.4),
-        abscissa_mm=12.0,
-        width_mm=3.0,
-        neck_mm=2.2,
-        direction=np.array([1.0, 0.0, 0.0]),
-    )
-    whole = trace(Vessel(phantoms.phantom_surface(tube, edge_mm=0.2)))
-    anatomy = restore(whole)
-    stent = vstent.deploy(vstent.find_design("silk"), anatomy).stent
-    case = flow_case(anatomy, (stent,), FlowSettings(inflow_mL_s=1.0))
-    media = tuple(sheet.part(is_over_restored(stent, anatomy, sheet.points_mm)) for sheet in case.media)
-    return replace(case, vessel=trim(whole, upstream_mm=5.0, downstream_mm=3.0), media=media)
+    return covered(vstent.find_design("silk"), FlowSettings(inflow_mL_s=1.0))
 
 
 def with_numerics(case: FlowCase, **changes: object) -> FlowCase:

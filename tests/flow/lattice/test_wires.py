@@ -4,13 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from small_neck import covered
 
 import vstent
-from vstent import phantoms
-from vstent.anatomy.restore.restore import restore
-from vstent.anatomy.trace import trace
-from vstent.anatomy.trim import trim
-from vstent.deployment.struts import is_over_restored, united
+from vstent.deployment.struts import united
 from vstent.flow import domain, simulation
 from vstent.flow.case import FlowCase
 from vstent.flow.indices import indices
@@ -19,10 +16,8 @@ from vstent.flow.lattice.cost import estimate
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.reading import exchanged, force_N
 from vstent.flow.lattice.state import State
-from vstent.flow.problem import flow_case
 from vstent.flow.settings import FlowSettings, Numerics
 from vstent.flow.simulation import simulate_case
-from vstent.geometry.vessel import Vessel
 from vstent.kernels.arrays import Floats
 from vstent.units import duration
 
@@ -32,21 +27,9 @@ CELL_MM = 0.075
 @pytest.fixture(scope="module")
 def resolved() -> FlowCase:
     """A short tube with a sac, and the part of a device with wide struts that lies over its neck."""
-    tube = phantoms.with_sac(
-        phantoms.tube(length_mm=24.0, radius_mm=1.4),
-        abscissa_mm=12.0,
-        width_mm=3.0,
-        neck_mm=2.2,
-        direction=np.array([1.0, 0.0, 0.0]),
-    )
-    whole = trace(Vessel(phantoms.phantom_surface(tube, edge_mm=0.2)))
-    anatomy = restore(whole)
     design = replace(vstent.find_design("enterprise"), strut_width_um=220.0, strut_thickness_um=220.0)
-    stent = vstent.deploy(design, anatomy).stent
     numerics = Numerics(cell_size_mm=CELL_MM, wires="resolved")
-    case = flow_case(anatomy, (stent,), FlowSettings(inflow_mL_s=1.0, numerics=numerics))
-    media = tuple(sheet.part(is_over_restored(stent, anatomy, sheet.points_mm)) for sheet in case.media)
-    return replace(case, vessel=trim(whole, upstream_mm=5.0, downstream_mm=3.0), media=media)
+    return covered(design, FlowSettings(inflow_mL_s=1.0, numerics=numerics))
 
 
 def test_the_blood_is_the_lumen_without_the_wires(resolved: FlowCase) -> None:
