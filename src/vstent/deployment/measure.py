@@ -28,10 +28,8 @@ def measure(anatomy: Anatomy, deployment: Deployment) -> Measures:
 
     Parameters
     ----------
-    anatomy : Anatomy
-        The artery; a device on another path is measured on that.
-    deployment : Deployment
-        The deployed device.
+    anatomy : the artery; a device on another path is measured on that.
+    deployment : the deployed device.
 
     Returns
     -------
