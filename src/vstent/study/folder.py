@@ -57,14 +57,8 @@ def claimed(out: Path) -> Iterator[None]:
     """Reserve a case folder for this process.
 
     Files that a killed process left half-written there are removed. Folders created here are removed at the end if they
-    are empty.
-
-    Raises
-    ------
-    FolderError
-        Another process uses the folder, or it cannot be written.
-    ReadError
-        It is a case folder of an older version.
+    are empty. FolderError is raised where another process uses the folder or it cannot be written, and ReadError where
+    it is a case folder of an older version.
     """
     refuse_older(out)
     cache = out / CACHE
