@@ -77,7 +77,9 @@ def test_a_cell_that_is_turned_about_its_height_is_as_wide_as_its_cosine(turn_ra
     if turn_rad > 1.0:
         assert width[found.narrowest] == pytest.approx(expected, abs=0.005)
         assert found.n_crumpled >= 1
-        assert found.abscissa_mm[found.narrowest] == pytest.approx(stent.row_abscissa_mm[row * shape.row_split], abs=0.3)
+        assert found.abscissa_mm[found.narrowest] == pytest.approx(
+            stent.row_abscissa_mm[row * shape.row_split], abs=0.3
+        )
 
 
 @pytest.mark.parametrize("design", [ENTERPRISE, PIPELINE])

@@ -38,21 +38,10 @@ ROWS: Final = (
 )
 """Rows of the comparison of flows: title and key of the index."""
 CONTRAST_ROWS: Final = (
-    "contrast_preview_error_fraction",
-    "contrast_arrival_s",
-    "contrast_peak_s",
-    "contrast_peak_fraction",
-    "washout_half_life_s",
-    "contrast_retention_s",
-    "contrast_mean_transit_s",
-    "mean_sac_age_s",
-    "turnover_time_s",
-    "unexchanged_after_1s_volume_mm3",
-    "unexchanged_after_2s_volume_mm3",
-    "unexchanged_after_5s_volume_mm3",
-    "unexchanged_after_5s_area_mm2",
-    "fast_sac_volume_mm3",
-    "mean_sac_velocity_m_s",
+    *("contrast_preview_error_fraction", "contrast_arrival_s", "contrast_peak_s", "contrast_peak_fraction"),
+    *("washout_half_life_s", "contrast_retention_s", "contrast_mean_transit_s", "mean_sac_age_s", "turnover_time_s"),
+    *(f"unexchanged_after_{moment}s_volume_mm3" for moment in (1, 2, 5)),
+    *("unexchanged_after_5s_area_mm2", "fast_sac_volume_mm3", "mean_sac_velocity_m_s"),
 )
 """Keys of the table of angiograms."""
 DEVICE_ROWS: Final = (
