@@ -600,31 +600,28 @@ class Preview:
             at_mm = float(np.clip(abscissa_mm, 0.0, anatomy.parent.axis.length_mm))
             center, frame = (found[0] for found in across.at(np.array([at_mm])))
             radius_mm = float(np.interp(at_mm, anatomy.parent.axis.abscissa_mm, anatomy.parent.section_radius_mm))
-            shown = {
+            shown: dict[str, Any] = {
                 "abscissa_mm": at_mm,
                 "artery_diameter_mm": 2 * radius_mm,
                 "lumen": _section(anatomy.vessel.lumen, center, frame),
                 "landing": _section(anatomy.parent.landing_surface, center, frame),
             }
             deployed: dict[str, Deployment] = {} if name is None else self.deployed(self.placed(self.choice(name)))
-            rings: list[Any] = []
             if not deployed:
                 return shown
-            rows = {key: _row_at(one.stent, at_mm) for key, one in deployed.items()}
-            for key, row in rows.items():
-                if row is not None:
-                    ring = (deployed[key].stent.nodes_mm[row] - center) @ frame[1:].T
-                    rings.append(np.round(np.append(ring, ring[:1], axis=0), 3).ravel().tolist())
-            shown_id = implant if implant and implant in deployed else next(iter(deployed))
-            at_row, stent = rows[shown_id], deployed[shown_id].stent
-            if at_row is None:
-                return shown | {"rings": rings}
-            return shown | {
-                "rings": rings,
-                "device_diameter_mm": float(stent.row_diameter_mm[at_row]),
-                "free_diameter_mm": float(free_diameters_mm(stent.design, stent.size)[at_row]),
-                "max_gap_mm": float(deployed[shown_id].wall_gap_mm[at_row].max()),
-            }
+            shown["rings"], shown_id = [], implant if implant in deployed else next(iter(deployed))
+            for key, one in deployed.items():
+                if (row := _row_at(one.stent, at_mm)) is None:
+                    continue
+                ring = (one.stent.nodes_mm[row] - center) @ frame[1:].T
+                shown["rings"].append(np.round(np.append(ring, ring[:1], axis=0), 3).ravel().tolist())
+                if key == shown_id:
+                    shown |= {
+                        "device_diameter_mm": float(one.stent.row_diameter_mm[row]),
+                        "free_diameter_mm": float(free_diameters_mm(one.stent.design, one.stent.size)[row]),
+                        "max_gap_mm": float(one.wall_gap_mm[row].max()),
+                    }
+            return shown
 
 
 def _flow_name(name: str, end: str) -> str:

@@ -7,14 +7,8 @@ from typing import Final
 from vstent.anatomy.landing_zones import beside_neck, neck_points_mm, neck_span_mm
 from vstent.deployment.crumpling import cells, place_of_narrowest
 from vstent.deployment.method import Course
-from vstent.deployment.sizing import (
-    APPOSED_GAP_MM,
-    LOOSE_FRACTION,
-    OVERSIZED_FRACTION,
-    oversizing_fraction,
-    reach_mm,
-    wanted_margin_mm,
-)
+from vstent.deployment.sizing import OVERSIZED_FRACTION, oversizing_fraction, reach_mm, wanted_margin_mm
+from vstent.deployment.wall import APPOSED_GAP_MM, LOOSE_FRACTION
 from vstent.devices.formulas import free_diameters_mm
 from vstent.devices.stent import Stent
 from vstent.geometry.vessel import Anatomy

@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from vstent.deployment import forks, sizing, wires
+from vstent.deployment import forks, wires
 from vstent.deployment.advice import advise
 from vstent.deployment.basket import deploy_basket
 from vstent.deployment.braid import ConstantWire
 from vstent.deployment.coils import deploy_coils
 from vstent.deployment.method import AbstractMethod, Course, Placement, Progress, Zhong2016, laid_inside, run
 from vstent.deployment.nested import kept_inside
+from vstent.deployment.sizing import propose_landing as propose_landing, propose_size as propose_size
 from vstent.devices.catalogue import find_design
 from vstent.devices.design import Basket, Coil, Design, Size
 from vstent.devices.formulas import compacted
@@ -24,10 +25,6 @@ from vstent.units import MM_PER_UM
 
 METHODS: dict[str, type[ConstantWire] | type[Zhong2016]] = {"constant_wire": ConstantWire, "zhong2016": Zhong2016}
 """Deployment methods by name."""
-
-APPOSED_GAP_MM = sizing.APPOSED_GAP_MM
-propose_landing = sizing.propose_landing
-propose_size = sizing.propose_size
 
 
 def deploy(  # noqa: PLR0913 one keyword for each thing that can be chosen
