@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vstent.angiography.projection import Projector, projector_of
-from vstent.angiography.view import View
+from vstent.angiography.view import View, check_range
 from vstent.devices.stent import Stent
 from vstent.errors import InputError
 from vstent.flow.media import cut
@@ -87,18 +87,11 @@ def film_of(
 
     Frames between two given times are interpolated linearly.
     """
-    check_frame_rate(frame_rate_Hz)
+    check_range("frame rate", frame_rate_Hz, *FRAME_RATES_HZ, "per second")
     per_mg_mL_mm = iodine_cm2_g(energy_keV) * CM2_G_PER
     shadows = ((time_s, projector(values) * np.float32(per_mg_mL_mm)) for time_s, values in frames)
     found = list(_resampled(shadows, 1.0 / frame_rate_Hz))
     return Film(projector.view, np.array([time_s for time_s, _ in found]), np.stack([one for _, one in found]))
-
-
-def check_frame_rate(frame_rate_Hz: float) -> None:
-    """Raise InputError where a frame rate is out of range."""
-    low, high = FRAME_RATES_HZ
-    if not low <= frame_rate_Hz <= high:
-        raise InputError(f"A frame rate of {frame_rate_Hz:g} per second is out of range. Give {low:g} to {high:g}.")
 
 
 def _resampled(
