@@ -43,7 +43,7 @@ def test_key_frames_are_half_peak_half_and_5_s_after():
 
 
 def test_films_side_by_side_keep_their_pixels_below_the_captions():
-    pair = [Shown("Before", film()), Shown("Silk", film(3.0), wires=np.full((32, 48), 0.1, np.float32))]
+    pair = [Shown("Before", film()), Shown("Silk", film(3.0), wires=[np.full((32, 48), 0.1, np.float32)])]
     frames = beside(pair, 0.8)
     assert len(frames) == 81
     assert frames[0].shape == (32 + CAPTION_PX, 2 * 48 + GAP_PX)

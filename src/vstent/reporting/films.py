@@ -56,8 +56,8 @@ class Shown:
     """What it shows: Before, or the device."""
     film: Film
     """The film."""
-    wires: NDArray[np.float32] | None = None
-    """(rows, columns) absorption by the wires; None: not shown."""
+    wires: Sequence[NDArray[np.float32]] = ()
+    """(rows, columns) absorption by the wires of every device; empty: not shown."""
     vessel: NDArray[np.float32] | None = None
     """(rows, columns) path length within the lumen; None: not shown."""
 
@@ -79,8 +79,7 @@ def shown_of(
     rates = {"frame_rate_Hz": settings.frame_rate_Hz, "energy_keV": settings.energy_keV}
     for name, history in histories.items():
         film = film_of(history.frames(), projectors[name], **rates)
-        shadows = [wire_shadow(view, stent) for stent in stents.get(name, ()) if settings.has_wires]
-        wires = np.sum(np.stack(shadows), axis=0) if shadows else None
+        wires = [wire_shadow(view, stent) for stent in stents.get(name, ()) if settings.has_wires]
         vessel = projectors[name](np.ones(history.stored.shape[1])) if settings.has_vessel else None
         found[name] = Shown(titles[name], film, wires, vessel)
     return found
