@@ -11,6 +11,7 @@ from rich.console import Console as RichConsole
 from rich.status import Status
 from rich.table import Column, Table
 
+from vstent.deployment.coverage import UNION
 from vstent.devices.design import Design
 from vstent.devices.fit import Fitted
 from vstent.devices.ranges import MARGIN
@@ -59,8 +60,6 @@ DEVICE_ROWS: Final = (
 """Rows of the comparison of deployments: title and key of the measure."""
 
 
-NECK_UNION: Final = "neck_union_coverage_fraction"
-"""Key of the metal coverage of the neck by all devices of a treatment."""
 QUIET_S: Final = 30.0
 """Time between progress lines where the output is not a terminal, in s."""
 
@@ -134,9 +133,9 @@ def comparison_table(metrics: Mapping[str, Any]) -> Table:
         ]
         if any(cells):
             table.add_row(title, "", *cells)
-    unions = [treatment.get("together", {}).get(NECK_UNION) for treatment in treatments.values()]
+    unions = [treatment.get("together", {}).get(UNION) for treatment in treatments.values()]
     if any(len(treatment["implants"]) > 1 for treatment in treatments.values()) and any(unions):
-        table.add_row("Metal on the neck, all devices", "", *(_cell(NECK_UNION, union) for union in unions))
+        table.add_row("Metal on the neck, all devices", "", *(_cell(UNION, union) for union in unions))
     if bare:
         table.add_section()
         _add_flow_rows(table, metrics, {key: title for title, key in ROWS})

@@ -9,11 +9,9 @@ from pathlib import Path
 from typing import IO, Final
 
 from vstent.errors import FolderError, ReadError
-from vstent.io.files import sweep
+from vstent.io.files import CACHE as CACHE, sweep
 from vstent.study.store import UNREADABLE
 
-CACHE: Final = ".vstent"
-"""Subfolder of the case folder with the store and the lock."""
 RUN: Final = "run.json"
 """File of the case folder with the provenance of the run."""
 INPUT: Final = "input.json"
