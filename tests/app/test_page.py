@@ -829,7 +829,7 @@ def test_what_cannot_be_chosen_on_the_page_stays_as_the_study_had_it(flown, tmp_
     folder, told = flown
     pulse = Waveform(0.8, (0.2,), (0.1,))
     blood = Blood(1050.0, 0.0035, CarreauYasuda())
-    flow = FlowSettings(inflow_mL_s=1.0, blood=blood, waveform=pulse, numerics=Numerics(close_up=True))
+    flow = FlowSettings(inflow_mL_s=1.0, blood=blood, waveform=pulse, numerics=Numerics(refine=("sac",)))
     given = replace(settings_of(told["settings"]), flow=flow, uncertainty=Ranges(16, landing_mm=2.0))
     told["settings"] = asdict(given)
     (folder / "run.json").write_text(json.dumps(told))

@@ -46,7 +46,7 @@ NO_FIELD = {
     "uncertainty-flows": "too long for a page",
 } | dict.fromkeys(
     (
-        *("density", "viscosity", "shear-thinning", "refine-sac", "engine", "processes", "gpu"),
+        *("density", "viscosity", "shear-thinning", "refine", "engine", "processes", "gpu"),
         *("vary-threshold", "vary-landing", "vary-device", "vary-inflow", "vary-numbers"),
     ),
     OF_STUDY,

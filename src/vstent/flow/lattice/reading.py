@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vstent.deployment.struts import thickness_mm
-from vstent.flow import domain as domains
+from vstent.flow import domain as domains, sampling
 from vstent.flow.case import FlowField, Level, Phase
 from vstent.flow.ends import outflows
 from vstent.flow.engines import Outcome
 from vstent.flow.indices import neck_diameter_mm
-from vstent.flow.lattice.levels import WIDTH
+from vstent.flow.lattice.levels import WIDTH, further_levels
 from vstent.flow.lattice.setup import CELL_REYNOLDS
 from vstent.flow.lattice.state import NECK_INFLOW, Snapshot, State, trusted
 from vstent.flow.lattice.stepping import read_here, snapshot
@@ -108,7 +108,7 @@ def field_of(
     phases: tuple[Phase, ...] = (),
 ) -> FlowField:
     """Return the flow field of a run from the flow on the levels kept, and on finer ones for the values at the wall."""
-    vessel, flow, finest = state.case.vessel, joined(state, flows), state.levels[-1]
+    vessel, flow, finest = state.case.vessel, joined(state, flows), state.at_wires
     section_Pa = domains.section_pressure_Pa(vessel, state.domain, flow.pressure_Pa)
     inlet_Pa, outlet_Pa = vessel.of_inlets_and_outlets(section_Pa)
     levels = tuple(
@@ -152,7 +152,7 @@ def neck_mL_s(state: State, check: int = -1) -> float | None:
 
 def _remarks(state: State, levels: Sequence[Level], phases: Sequence[Phase]) -> str:
     """Return sentences on wires, levels, GPU, and on where the grid is too coarse for the vessel or for the flow."""
-    case, finest, remarks = state.case, state.levels[-1].domain, ""
+    case, finest, remarks = state.case, state.at_wires.domain, ""
     wires = domains.wires_of(case, finest.cell_size_mm)
     if wires is not None:
         remarks += (
@@ -160,19 +160,22 @@ def _remarks(state: State, levels: Sequence[Level], phases: Sequence[Phase]) -> 
             "cells in gaps narrower than a cell are closed."
         )
     elif case.has_screen and case.ostium is not None:
-        across = neck_diameter_mm(case.ostium) / finest.cell_size_mm
+        finest_mm = sampling.spacing_mm([one.domain for one in state.levels], case.ostium.vertices_mm)
+        across = neck_diameter_mm(case.ostium) / finest_mm
         if across < FEWEST_ACROSS_NECK:
             remarks += (
                 f" Under-resolved neck: it has {across:.0f} cells across. With fewer than {FEWEST_ACROSS_NECK} behind "
                 "a dense braid, neck inflow and sac velocity are up to a third too high: use a grid spacing of "
-                f"{across / FEWEST_ACROSS_NECK * finest.cell_size_mm:.2g} mm or, on the processor, leave it open."
+                f"{across / FEWEST_ACROSS_NECK * finest_mm:.2g} mm or, on the processor, leave it open."
             )
     if len(state.levels) > 1:
         sizes = ", ".join(f"{one.domain.cell_size_mm:.3g} mm ({len(one.domain.cells):,} cells)" for one in state.levels)
         remarks += f" The grid spacing is {sizes}, from the whole vessel to the finest level."
     if state.device is not None:
         remarks += f" Time steps were launched on the GPU {state.device.how}."
-    remarks += domains.too_narrow(case, state.main.domain.cell_size_mm) + domains.unreached(case.vessel, state.domain)
+    size_mm = state.kept[-1].domain.cell_size_mm
+    size_mm /= WIDTH ** further_levels(case, size_mm)
+    remarks += domains.too_narrow(case, size_mm) + domains.unreached(case.vessel, state.domain)
     for number, (level, own) in enumerate(zip(state.kept, levels, strict=True)):
         moments_m_s = [phase.velocity_m_s[number] for phase in phases] or [own.velocity_m_s]
         speed_m_s = np.max([np.linalg.norm(one, axis=1) for one in moments_m_s], axis=0)

@@ -73,9 +73,13 @@ def build(
     else:
         begun = start
     grids = _grids(case, cell_size_mm)
-    finest, last = grids[-1]
-    if last is not None and domains.wires_of(case, finest.domain.cell_size_mm):
-        case = beside_walls(case, finest.domain.centers_mm[last.is_trusted])
+    inside_mm = [
+        grid.domain.centers_mm[between.is_trusted]
+        for grid, between in grids
+        if between is not None and domains.wires_of(case, grid.domain.cell_size_mm)
+    ]
+    if inside_mm:
+        case = beside_walls(case, np.concatenate(inside_mm))
     levels = [_level(case, grid, check_s, WIDTH**depth * pace, begun, kept) for depth, (grid, _) in enumerate(grids)]
     state = levels[0]
     for coarse, fine, (_, between) in zip(levels[:-1], levels[1:], grids[1:], strict=True):
@@ -148,7 +152,7 @@ def _grids(case: FlowCase, cell_size_mm: float) -> list[tuple[Grid, Interface | 
     sizes = sizes_mm(case, cell_size_mm)
     coarsest_mm, finest_mm = sizes[0], sizes[-1]
     are_walls = domains.wires_of(case, finest_mm) is not None
-    part = (case.sac, case.numerics.close_up) if len(sizes) > 1 else None
+    part = (case.sac, case.numerics.refine, case.is_split_given) if len(sizes) > 1 else None
     key = sizes, part, case.solids if are_walls else ()
     if key not in built:
         for of_walls in [other for other in built if other[2]]:  # of another device, or of another tile of it
@@ -157,7 +161,12 @@ def _grids(case: FlowCase, cell_size_mm: float) -> list[tuple[Grid, Interface | 
         limit = thickest(case, domain)
         grids: list[tuple[Grid, Interface | None]] = [(Grid(domain, limit, address(domain, limit)), None)]
         while len(grids) < len(sizes):
-            coarse, fine, between = refined(case, grids[-1][0], finest_mm)
+            try:
+                coarse, fine, between = refined(case, grids[-1][0], cell_size_mm)
+            except domains.CoarseGridError:
+                if len(grids) <= case.numerics.coarser_levels:
+                    raise
+                break  # a branch so short that its border leaves nothing
             grids[-1:] = (coarse, grids[-1][1]), (fine, between)
         built[key] = grids
     return [(grid, between and between.anew()) for grid, between in built[key]]
@@ -493,7 +502,7 @@ def monitored(state: State, now: Sequence[Snapshot]) -> Floats:
     """
     first_inflow = state.links.patch[np.argmax(state.links.is_inflow)]
     inlet = state.domain.link_cell[state.domain.link_patch == first_inflow]
-    in_sac = speeds(now[len(state.kept) - 1].velocity_m_s[state.main.sac_cells])
+    in_sac = speeds(now[state.levels.index(state.main)].velocity_m_s[state.main.sac_cells])
     values = [in_sac.mean(), now[0].pressure_Pa[inlet].mean(), now[0].speed_m_s.mean()]
     if state.neck:
         parts = zip(state.levels, now, state.neck, strict=True)
