@@ -114,8 +114,8 @@ def measures_of(case: FlowCase, field: FlowField, found: Mapping[str, float]) ->
     if not case.is_split_given:
         shares = zip(outlets, murray_shares(outlets), strict=True)
         across = min(outlet.diameter_mm for outlet, share in shares if share >= COUNTED_SHARE) / spacing_mm
-        finer = min(further_levels(case, spacing_mm), max(0, ceil(log2(BRANCH_CELLS / across))))
-        measures["cells_across_outlet_count"] = across * WIDTH**finer
+        further = min(further_levels(case, spacing_mm), max(0, ceil(log2(BRANCH_CELLS / across))))
+        measures["cells_across_outlet_count"] = across * WIDTH**further
     if np.isfinite(field.unsettled_fraction):
         measures["unsettled_fraction"] = field.unsettled_fraction
     if case.sac is None or case.ostium is None:

@@ -14,7 +14,7 @@ from vstent.flow.domain import default_cell_size_mm, extended_volume_mm3
 from vstent.flow.lattice.gpu import free_gpu_bytes
 from vstent.flow.lattice.kernels import d3q19, lanes
 from vstent.flow.lattice.kernels.warm import keep_flow
-from vstent.flow.lattice.levels import WIDTH, sizes_mm, volume_mm3
+from vstent.flow.lattice.levels import WIDTH, box_points, further_levels, sizes_mm, volume_mm3
 from vstent.flow.lattice.pace import pace
 from vstent.flow.memory import free_memory_bytes
 from vstent.units import duration
@@ -26,6 +26,9 @@ BYTES_PER_PHASE_AND_CELL = 32
 """Memory in bytes per stored phase of a cycle and cell."""
 BYTES_PER_GRID_POINT = 6
 """Memory in bytes per grid point of the box around the vessel (measured: 3)."""
+BYTES_PER_BOX_POINT = 15
+"""Memory in bytes per grid point of the box around narrow branches, while the finest level there is built (measured on
+83 million points)."""
 MOST_CELLS = 1e8
 """Maximum number of cells whose 19 populations can be addressed with 32 bits, cells beside the wall included (2^31 / 19
 storage places)."""
@@ -145,8 +148,10 @@ def _size(case: FlowCase, cell_size_mm: float) -> tuple[float, float]:
     widest = max(opening.diameter_mm for opening in vessel.openings)
     box_mm3 = float(np.prod(np.ptp(vessel.lumen.vertices_mm, axis=0) + 2 * widest))
     phases = 0 if case.waveform is None else PHASES
-    of_cell = BYTES_PER_CELL + phases * BYTES_PER_PHASE_AND_CELL
-    return cells, BYTES_AT_LEAST + box_mm3 / cell_size_mm**3 * BYTES_PER_GRID_POINT + cells * of_cell
+    of_cell, further = BYTES_PER_CELL + phases * BYTES_PER_PHASE_AND_CELL, further_levels(case, cell_size_mm)
+    of_boxes = box_mm3 / cell_size_mm**3 * BYTES_PER_GRID_POINT
+    of_boxes += BYTES_PER_BOX_POINT * box_points(case, cell_size_mm * WIDTH / WIDTH**further) * (further > 0)
+    return cells, BYTES_AT_LEAST + of_boxes + cells * of_cell
 
 
 def _steps(case: FlowCase, cell_size_mm: float) -> int:

@@ -62,6 +62,8 @@ OWN_LAYER: Final = 4
 """First layer in which the finer level counts: mass that crosses into it is compared."""
 RIM: Final = 3
 """Number of layers added around the cells to be refined."""
+BORDER: Final = 5
+"""Distance in cells to which it approaches cells outside the border with a coarser grid."""
 OPENING_CELLS: Final = 2
 """Distance in cells to which a refined part approaches the end of an opening, which only the coarsest level has."""
 LACK_PART: Final = 0.15
@@ -79,12 +81,14 @@ MARGIN_CELLS: Final = 14.0
 the border and `RIM` leave no room for that along diagonals."""
 FURTHER: Final = 2
 """Most levels below the grid spacing that narrow branches get."""
-MOST_POINTS: Final = 2e8
-"""Most grid points in the box around narrow branches on such a level: 0.8 GB (see `cost.BYTES_PER_GRID_POINT`)."""
+MOST_POINTS: Final = 1e8
+"""Most grid points in the box around narrow branches on such a level: 1.5 GB (see `cost.BYTES_PER_BOX_POINT`)."""
 SAMPLES: Final = 1e6
 """About the most points at which blood is looked for to estimate a volume."""
 SCREEN_CELLS: Final = 4.0
 """Distance in cells from a neck with a screen, which is spread over layers of cells, up to which a grid is refined."""
+FULL: Final = np.ones((3, 3, 3), dtype=bool)
+"""A cell and its 26 neighbours."""
 CHANGING: Final = ("crossed", "lack", "push")
 """Arrays of an `Interface` that change during a run."""
 CHUNK: Final = 10_000
@@ -161,10 +165,7 @@ class Interface:
 def require_sac(case: FlowCase) -> Surface:
     """Return the sac of a case, around which the grid is refined; raise a `FlowError` where there is none."""
     if case.sac is None:
-        raise FlowError(
-            "the grid cannot be refined in the sac, because this vessel has none: leave out --refine sac, or give a "
-            "ball X,Y,Z,R"
-        )
+        raise FlowError("the grid cannot be refined in the sac, because this vessel has none: leave out --refine sac")
     return case.sac
 
 
@@ -190,10 +191,7 @@ def near_sac(case: FlowCase, grid: Domain) -> Bools:
 
 
 def _balls(case: FlowCase, size_mm: float) -> Floats:
-    """Return centers and radii (b, 4) of the balls to be refined, each with a cell of this size at least.
-
-    A `FlowError` is raised where one holds no blood.
-    """
+    """Return centers and radii (b, 4) of the balls to be refined, each wide enough for a cell of this size."""
     balls = np.array([one for one in case.numerics.refine if not isinstance(one, str)], dtype=float).reshape(-1, 4)
     away_mm = case.vessel.closed.signed_distance(balls[:, :3])
     for x, y, z, radius_mm in balls[away_mm >= balls[:, 3]]:
@@ -206,13 +204,10 @@ def _balls(case: FlowCase, size_mm: float) -> Floats:
 
 
 def _narrow(case: FlowCase, size_mm: float) -> Floats:
-    """Return centers and radii (m, 4) of spheres along branches too narrow for a grid with this spacing.
-
-    There are none where the flow through a branch does not depend on its resistance.
-    """
+    """Return centers and radii (m, 4) of spheres along branches too narrow for a grid, if their resistance matters."""
     lines = () if case.is_split_given else case.vessel.centerlines
-    columns = [np.column_stack([one.points_mm, 1.5 * one.inscribed_radius_mm]) for one in lines]
-    found = np.concatenate([np.zeros((0, 4)), *columns])
+    spheres = [np.column_stack([one.points_mm, 1.5 * one.inscribed_radius_mm]) for one in lines]
+    found = np.concatenate([np.zeros((0, 4)), *spheres])
     return found[2 * found[:, 3] < 1.5 * domains.BRANCH_CELLS * size_mm]
 
 
@@ -227,7 +222,7 @@ def _spheres(case: FlowCase, size_mm: float, cell_size_mm: float) -> Floats:
 def _in(spheres: Floats, points_mm: Floats) -> Bools:
     """Return whether points (n, 3) lie in spheres (m, 4)."""
     result = np.zeros(len(points_mm), dtype=bool)
-    if len(points_mm) and len(spheres):
+    if len(spheres):
         for inside in cKDTree(points_mm).query_ball_point(spheres[:, :3], spheres[:, 3]):
             result[inside] = True
     return result
@@ -243,22 +238,24 @@ def _box_mm(spheres: Floats, margin_mm: float) -> tuple[Floats, Floats]:
 def further_levels(case: FlowCase, cell_size_mm: float) -> int:
     """Return the number of levels finer than the grid spacing that narrow branches get."""
     most = FURTHER if "branches" in case.numerics.refine else 0
-    for count in range(most):
-        size_mm = cell_size_mm / WIDTH**count
-        narrow = _narrow(case, size_mm)
-        if not len(narrow) or (_box_mm(narrow, RIM * size_mm)[1] * WIDTH / size_mm).prod() > MOST_POINTS:
-            return count
-    return most
+    fits = (0 < box_points(case, cell_size_mm / WIDTH**count) < MOST_POINTS for count in range(most))
+    return next((count for count, fits_too in enumerate(fits) if not fits_too), most)
 
 
-def _reach_mm(case: FlowCase, size_mm: float, cell_size_mm: float) -> float:
+def box_points(case: FlowCase, size_mm: float) -> float:
+    """Return the number of points in the box of the finer grid in branches too narrow for a spacing; 0 without them."""
+    narrow = _narrow(case, size_mm)
+    return float((_box_mm(narrow, RIM * size_mm)[1] * WIDTH / size_mm).prod()) if len(narrow) else 0.0
+
+
+def _reach_mm(case: FlowCase, size_mm: float, finest_mm: float) -> float:
     """Return the distance to which a grid with this spacing is refined around wires or a neck (see `_around`)."""
     if case.has_screen:
         own_mm = SCREEN_CELLS * size_mm
     else:
         assert case.wires is not None
         own_mm = thickness_mm(case.wires)
-    return own_mm + MARGIN_CELLS * max(0.0, size_mm - WIDTH * cell_size_mm / WIDTH ** wire_levels(case, cell_size_mm))
+    return own_mm + MARGIN_CELLS * max(0.0, size_mm - WIDTH * finest_mm)
 
 
 def _around(case: FlowCase) -> Surface:
@@ -295,18 +292,18 @@ def beside_walls(case: FlowCase, blood_mm: Floats) -> FlowCase:
     return replace(case, media=tuple(left(one) for one in case.media))
 
 
-def near_wires(case: FlowCase, grid: Domain, cell_size_mm: float) -> Bools:
-    """Return whether each cell (n,) lies near the wires or the neck of a case."""
-    around, reach_mm = _around(case), _reach_mm(case, grid.cell_size_mm, cell_size_mm)
+def near_wires(case: FlowCase, grid: Domain, finest_mm: float) -> Bools:
+    """Return whether each cell (n,) lies near the wires or the neck of a case, where the finest has this spacing."""
+    around, reach_mm = _around(case), _reach_mm(case, grid.cell_size_mm, finest_mm)
     low, high = around.vertices_mm.min(axis=0) - reach_mm, around.vertices_mm.max(axis=0) + reach_mm
     result = ((grid.centers_mm > low) & (grid.centers_mm < high)).all(axis=1)
     result[result] = around.closest(grid.centers_mm[result])[1] < reach_mm
     return result
 
 
-def volume_near_wires_mm3(case: FlowCase, size_mm: float, cell_size_mm: float) -> float:
+def volume_near_wires_mm3(case: FlowCase, size_mm: float, finest_mm: float) -> float:
     """Estimate the volume of what is refined around wires or a neck on a grid with this spacing."""
-    reach_mm = _reach_mm(case, size_mm, cell_size_mm) + 1.2 * RIM * size_mm
+    reach_mm = _reach_mm(case, size_mm, finest_mm) + 1.2 * RIM * size_mm
     step_mm, corners_mm = reach_mm / 4, _around(case).corners_mm
     low_mm = corners_mm.min(axis=(0, 1)) - reach_mm - 2 * step_mm
     at = np.rint((corners_mm.mean(axis=1) - low_mm) / step_mm).astype(int)
@@ -325,18 +322,18 @@ def volume_mm3(case: FlowCase, size_mm: float, cell_size_mm: float) -> float:
         neck_mm2 = 0.0 if case.ostium is None else case.ostium.area_mm2
         stretch_mm = (UPSTREAM_DIAMETERS + DOWNSTREAM_DIAMETERS) * diameter_mm + sqrt(4 / pi * neck_mm2)
         result += abs(require_sac(case).volume_mm3) + pi / 4 * diameter_mm**2 * (stretch_mm + 2 * RIM * size_mm)
-    elif _are_around_wires(case, size_mm, cell_size_mm):
-        result += volume_near_wires_mm3(case, size_mm, cell_size_mm)
+    elif size_mm > around_wires_mm(case):
+        result += volume_near_wires_mm3(case, size_mm, cell_size_mm / WIDTH ** wire_levels(case, cell_size_mm))
     if len(spheres):
-        low_mm, edges_mm = _box_mm(spheres, (RIM + 1) * size_mm)
+        low_mm, edges_mm = _box_mm(spheres, RIM * size_mm)
         step_mm = max(size_mm, float(np.cbrt(edges_mm.prod() / SAMPLES)))
-        shape = tuple(np.ceil(edges_mm / step_mm).astype(int))
-        blood = voxels.fill((domains.extend(case.vessel)[0].corners_mm - low_mm) / step_mm, shape)
-        chosen = np.zeros(shape, dtype=bool)
-        cells = np.argwhere(blood)
+        x, y, z = np.ceil(edges_mm / step_mm).astype(int)
+        blood = voxels.fill((case.vessel.closed.corners_mm - low_mm) / step_mm, (x, y, z))
+        cells, chosen = np.argwhere(blood), np.zeros_like(blood)
         chosen[tuple(cells[_in(spheres, low_mm + step_mm * cells)].T)] = True
-        rim, full = max(1, round(RIM * size_mm / step_mm)), np.ones((3, 3, 3), dtype=bool)
-        result += float(ndimage.binary_dilation(chosen, full, rim, mask=blood).sum()) * step_mm**3
+        if size_mm == cell_size_mm * WIDTH**case.numerics.coarser_levels:  # finer rims lie in the border before
+            chosen = ndimage.binary_dilation(chosen, FULL, round(RIM * size_mm / step_mm) or 1, mask=blood)
+        result += float(chosen.sum()) * step_mm**3
     return min(result, domains.extended_volume_mm3(case.vessel))
 
 
@@ -346,28 +343,26 @@ def window(grid: Domain, is_wanted: Bools, is_outer: Bools | None = None) -> tup
     It keeps away from the cells (n,) of the grid that are outside the border with a coarser one, and of those carried.
     The layer is 0 outside the part; `CARRIED_UP` and deeper ones have the same number.
     """
-    full, shape = np.ones((3, 3, 3), dtype=bool), grid.index.shape
-    blood, within, ends = grid.index >= 0, np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+    blood, shape = grid.index >= 0, grid.index.shape
+    within, ends = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
     within[tuple(grid.cells[is_wanted].T)] = True
     ends[tuple(grid.cells[grid.link_cell[grid.link_patch > 0]].T)] = True
-    within = ndimage.binary_dilation(within, full, RIM, mask=blood)
-    within &= ~ndimage.binary_dilation(ends, full, OPENING_CELLS)
+    within = ndimage.binary_dilation(within, FULL, RIM, mask=blood)
+    within &= ~ndimage.binary_dilation(ends, FULL, OPENING_CELLS)
     if is_outer is not None:
         ends[:] = False
         ends[tuple(grid.cells[is_outer].T)] = True
-        within &= ~ndimage.binary_dilation(ends, full, WIDTH * len(CARRIED_UP) + 1)
+        within &= ~ndimage.binary_dilation(ends, FULL, BORDER)
     if not within.any():
-        raise domains.CoarseGridError(
-            f"at a grid spacing of {grid.cell_size_mm:.3g} mm no cell can be refined: use a finer grid spacing"
-        )
+        raise domains.CoarseGridError("no cell is left to be refined")
     front = blood & ~within
-    within |= ndimage.binary_dilation(within, full) & ~blood  # finer cells may lie between coarser ones and the wall
+    within |= ndimage.binary_dilation(within, FULL) & ~blood  # finer cells may lie between coarser ones and the wall
     layer = np.where(within, CARRIED_UP[-1] + 1, 0)
     for number in range(1, CARRIED_UP[-1] + 1):
-        front = ndimage.binary_dilation(front, full) & (layer > CARRIED_UP[-1])
+        front = ndimage.binary_dilation(front & blood, FULL) & (layer > CARRIED_UP[-1])
         layer[front] = number
-    low = np.argwhere(within).min(axis=0) - 1
-    part = within[tuple(slice(a, b) for a, b in zip(low, np.argwhere(within).max(axis=0) + 2, strict=True))]
+    low, high = np.argwhere(within).min(axis=0) - 1, np.argwhere(within).max(axis=0) + 2
+    part = np.pad(within, 1)[tuple(slice(a, b) for a, b in zip(low + 1, high + 1, strict=True))]
     fine = part.repeat(WIDTH, axis=0).repeat(WIDTH, axis=1).repeat(WIDTH, axis=2)
     size_mm = grid.cell_size_mm / WIDTH
     return Window(grid.origin_mm + low * grid.cell_size_mm - 0.5 * (grid.cell_size_mm - size_mm), fine), layer
@@ -376,8 +371,8 @@ def window(grid: Domain, is_wanted: Bools, is_outer: Bools | None = None) -> tup
 def sizes_mm(case: FlowCase, cell_size_mm: float) -> tuple[float, ...]:
     """Return the grid spacings of the levels of a case, coarse to fine, where `cell_size_mm` is wanted.
 
-    One is coarser where it is wanted in a part of the vessel; those around wires and in narrow branches are finer. A
-    `FlowError` is raised where that part does not exist.
+    One is coarser where it is wanted in a part of the vessel; those around wires and in narrow branches are finer.
+    Where there is no such part a `FlowError` is raised.
     """
     if "sac" in case.numerics.refine:
         require_sac(case)
@@ -389,12 +384,6 @@ def sizes_mm(case: FlowCase, cell_size_mm: float) -> tuple[float, ...]:
 def wire_levels(case: FlowCase, cell_size_mm: float) -> int:
     """Return the number of levels finer than the grid spacing around wires or a neck with a screen."""
     return ceil(log2(max(1.0, cell_size_mm / around_wires_mm(case))))
-
-
-def _are_around_wires(case: FlowCase, size_mm: float, cell_size_mm: float) -> bool:
-    """Return whether a grid with this spacing is refined around wires or a neck."""
-    finest_mm = cell_size_mm / WIDTH ** wire_levels(case, cell_size_mm)
-    return size_mm > max(1.5 * finest_mm, around_wires_mm(case))
 
 
 def around_wires_mm(case: FlowCase) -> float:
@@ -413,15 +402,15 @@ def around_wires_mm(case: FlowCase) -> float:
 def refined(case: FlowCase, coarse: Grid, cell_size_mm: float) -> tuple[Grid, Grid, Interface]:
     """Return a grid of a case with a grid spacing, the next finer one in it, and the coupling of both.
 
-    A grid coarser than the spacing is refined in the sac, in balls and in narrow branches, as the settings say; all are
-    around wires. Wires are walls of the finer grid where they are thick enough for it.
+    A grid coarser than the spacing is refined where the settings say; all are around wires and in narrow branches.
+    Wires are walls of the finer grid where they are thick enough for it.
     """
     wide = coarse.domain
     wanted = _in(_spheres(case, wide.cell_size_mm, cell_size_mm), wide.centers_mm)
     if wide.cell_size_mm > cell_size_mm and "sac" in case.numerics.refine:
         wanted |= near_sac(case, wide)
-    if _are_around_wires(case, wide.cell_size_mm, cell_size_mm):
-        wanted |= near_wires(case, wide, cell_size_mm)
+    if wide.cell_size_mm > around_wires_mm(case):
+        wanted |= near_wires(case, wide, cell_size_mm / WIDTH ** wire_levels(case, cell_size_mm))
     part, layer = window(wide, wanted, None if coarse.side is None else coarse.side % 2 == 0)
     size_mm = wide.cell_size_mm / WIDTH
     domain = domains.build(case.vessel, size_mm, part, domains.wires_of(case, size_mm))

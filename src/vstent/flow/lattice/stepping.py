@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from time import perf_counter
 from typing import Any, Final
@@ -29,6 +30,7 @@ from vstent.flow.lattice.levels import (
     beside_walls,
     refined,
     sizes_mm,
+    wire_levels,
 )
 from vstent.flow.lattice.scales import Scales, odd_rate
 from vstent.flow.lattice.screen import build_screen
@@ -73,13 +75,9 @@ def build(
     else:
         begun = start
     grids = _grids(case, cell_size_mm)
-    inside_mm = [
-        grid.domain.centers_mm[between.is_trusted]
-        for grid, between in grids
-        if between is not None and domains.wires_of(case, grid.domain.cell_size_mm)
-    ]
-    if inside_mm:
-        case = beside_walls(case, np.concatenate(inside_mm))
+    finest, last = grids[case.numerics.coarser_levels + wire_levels(case, cell_size_mm)]
+    if last is not None and domains.wires_of(case, finest.domain.cell_size_mm):
+        case = beside_walls(case, finest.domain.centers_mm[last.is_trusted])
     levels = [_level(case, grid, check_s, WIDTH**depth * pace, begun, kept) for depth, (grid, _) in enumerate(grids)]
     state = levels[0]
     for coarse, fine, (_, between) in zip(levels[:-1], levels[1:], grids[1:], strict=True):
@@ -160,14 +158,10 @@ def _grids(case: FlowCase, cell_size_mm: float) -> list[tuple[Grid, Interface | 
         domain = domains.build(case.vessel, coarsest_mm, wires=domains.wires_of(case, coarsest_mm))
         limit = thickest(case, domain)
         grids: list[tuple[Grid, Interface | None]] = [(Grid(domain, limit, address(domain, limit)), None)]
-        while len(grids) < len(sizes):
-            try:
+        with suppress(domains.CoarseGridError):  # the rest of a branch is too short
+            while len(grids) < len(sizes):
                 coarse, fine, between = refined(case, grids[-1][0], cell_size_mm)
-            except domains.CoarseGridError:
-                if len(grids) <= case.numerics.coarser_levels:
-                    raise
-                break  # a branch so short that its border leaves nothing
-            grids[-1:] = (coarse, grids[-1][1]), (fine, between)
+                grids[-1:] = (coarse, grids[-1][1]), (fine, between)
         built[key] = grids
     return [(grid, between and between.anew()) for grid, between in built[key]]
 
