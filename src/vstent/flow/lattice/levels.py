@@ -199,7 +199,7 @@ def _balls(case: FlowCase, size_mm: float) -> Floats:
             f"the ball of {radius_mm:.3g} mm around {place(np.array([x, y, z]))} in which the grid is to be refined "
             "holds no blood: move it into the vessel (--refine X,Y,Z,R)"
         )
-    balls[:, 3] = np.maximum(balls[:, 3], away_mm + size_mm)
+    balls[:, 3] = np.maximum(balls[:, 3], np.maximum(away_mm, 0.0) + size_mm)
     return balls
 
 
