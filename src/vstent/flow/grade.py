@@ -7,9 +7,9 @@ from math import ceil, log2
 from typing import Any, Final, Literal
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from vstent.devices.treatment import BARE
-from vstent.flow import sampling
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.domain import BRANCH_CELLS, mean_diameter_mm
 from vstent.flow.indices import neck_diameter_mm, parent_diameter_mm, residuals
@@ -120,7 +120,7 @@ def measures_of(case: FlowCase, field: FlowField, found: Mapping[str, float]) ->
         measures["unsettled_fraction"] = field.unsettled_fraction
     if case.sac is None or case.ostium is None:
         return measures
-    spacing_mm = sampling.spacing_mm(field.levels, case.ostium.vertices_mm)
+    spacing_mm = float(np.median(field.sizes_mm[cKDTree(field.centers_mm).query(case.ostium.vertices_mm)[1]]))
     measures["cells_across_parent_count"] = parent_diameter_mm(case) / spacing_mm
     measures["cells_across_neck_count"] = neck_diameter_mm(case.ostium) / spacing_mm
     measures["cells_across_sac_count"] = float(np.cbrt(6 * abs(case.sac.volume_mm3) / np.pi)) / spacing_mm

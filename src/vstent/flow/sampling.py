@@ -1,6 +1,6 @@
 """Values of a flow at points, the same flow on one uniform grid, and surfaces as sample points."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Final
 
@@ -43,14 +43,6 @@ def _on_levels(field: FlowField, points_mm: Floats) -> Iterator[tuple[Level, Boo
     for number, level in enumerate(field.levels):
         chosen = of_point == number
         yield level, chosen, level.places(points_mm[chosen])
-
-
-def spacing_mm(levels: Sequence[Cells], points_mm: Floats) -> float:
-    """Return the grid spacing that most of the points (m, 3) have on grids, coarse to fine."""
-    sizes_mm = np.full(len(points_mm), levels[0].cell_size_mm)
-    for grid in levels[1:]:
-        sizes_mm[grid.cells_at(points_mm) >= 0] = grid.cell_size_mm
-    return float(np.median(sizes_mm))
 
 
 def values_at(field: FlowField, points_mm: Floats) -> tuple[Floats, Floats]:

@@ -21,10 +21,8 @@ Outlets = Literal["zero_pressure", "murray", "split", "resistance", "windkessel"
 """Condition at the outlets."""
 Wires = Literal["auto", "screen", "calibrated", "resolved"]
 """How a flow takes the wires over necks and branches."""
-Region = Literal["sac", "branches"]
-"""Part of a vessel that a finer grid can be asked for in a word."""
-Ball = tuple[float, float, float, float]
-"""Center, LPS, and radius of a ball, mm."""
+Region = Literal["sac", "branches"] | tuple[float, float, float, float]
+"""Part of a vessel: a word, or center, LPS, and radius of a ball, mm."""
 RESISTING: Final = ("resistance", "windkessel")
 """Conditions with which the flow out follows the pressure."""
 Elements = tuple[float, float, float]
@@ -40,11 +38,11 @@ HIGH_SHEAR_VISCOSITY_PA_S: Final = 0.00345
 
 
 def read_region(text: str) -> str | tuple[float, ...]:
-    """Return a `Region`, or the center and radius of a ball, read from text."""
-    if text.strip() in get_args(Region):
-        return text.strip()
+    """Return a `Region` read from text."""
+    if (word := text.strip()) in ("sac", "branches"):
+        return word
     with suppress(InputError):
-        if len(found := numbers(text)) == len(get_args(Ball)):
+        if len(found := numbers(word)) == 4:
             return found
     raise InputError(
         f"{text!r} is no part of a vessel: give sac, branches, or center and radius of a ball in mm, such as 3,-12,8,2"
@@ -144,7 +142,7 @@ class Numerics:
         None, "grid-spacing", "spacing of the flow grid", limits=Limits("mm", 0.002, 1.0), usual="29 cells per diameter"
     )
     """Grid spacing; None: `cells_per_diameter` cells across the vessel, but at most `cell_budget` cells in all."""
-    refine: tuple[Region | Ball, ...] = setting(
+    refine: tuple[Region, ...] = setting(
         (),
         "refine",
         "where the grid is refined: with sac (and the artery near it) or a ball X,Y,Z,R the grid spacing holds only "

@@ -31,7 +31,7 @@ from vstent.flow.lattice.pace import peak_speed_m_s
 from vstent.flow.lattice.state import State
 from vstent.flow.lattice.stepping import build, take_pace
 from vstent.flow.problem import flow_case, vessel_case
-from vstent.flow.settings import OPENFOAM, Ball, Blood, FlowSettings, Numerics, Region
+from vstent.flow.settings import OPENFOAM, Blood, FlowSettings, Numerics, Region
 from vstent.flow.simulation import simulate_case
 from vstent.flow.waveform import OLDER_ADULT_ICA
 from vstent.geometry.surface import Surface
@@ -357,7 +357,7 @@ def narrow_branches() -> Vessel:
     return trace(Vessel(phantoms.phantom_surface(phantom, edge_mm=0.12)))
 
 
-def of_branches(refine: tuple[Region | Ball, ...], cell_size_mm: float = 0.35) -> FlowCase:
+def of_branches(refine: tuple[Region, ...], cell_size_mm: float = 0.35) -> FlowCase:
     """0.3 mL/s for both branches together, which they share by their resistance."""
     numerics = Numerics(cell_size_mm=cell_size_mm, refine=refine, tolerance=0.03)
     case = vessel_case(narrow_branches(), FlowSettings(inflow_mL_s=1.0, numerics=numerics))
@@ -454,7 +454,7 @@ def test_the_border_of_a_refined_part_does_not_reach_through_a_wall() -> None:
 
 
 def test_a_branch_too_short_for_another_level_goes_without(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(levels, "BORDER", 60)
+    monkeypatch.setattr(levels, "CARRIED_UP", (4, 5, *range(6, 34)))
     assert len(LatticeBoltzmann(0.351).init(of_branches(("branches",), 0.351), None).levels) == 2
 
 

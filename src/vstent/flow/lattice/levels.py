@@ -62,8 +62,6 @@ OWN_LAYER: Final = 4
 """First layer in which the finer level counts: mass that crosses into it is compared."""
 RIM: Final = 3
 """Number of layers added around the cells to be refined."""
-BORDER: Final = 5
-"""Distance in cells to which it approaches cells outside the border with a coarser grid."""
 OPENING_CELLS: Final = 2
 """Distance in cells to which a refined part approaches the end of an opening, which only the coarsest level has."""
 LACK_PART: Final = 0.15
@@ -83,12 +81,8 @@ FURTHER: Final = 2
 """Most levels below the grid spacing that narrow branches get."""
 MOST_POINTS: Final = 1e8
 """Most grid points in the box around narrow branches on such a level: 1.5 GB (see `cost.BYTES_PER_BOX_POINT`)."""
-SAMPLES: Final = 1e6
-"""About the most points at which blood is looked for to estimate a volume."""
 SCREEN_CELLS: Final = 4.0
 """Distance in cells from a neck with a screen, which is spread over layers of cells, up to which a grid is refined."""
-FULL: Final = np.ones((3, 3, 3), dtype=bool)
-"""A cell and its 26 neighbours."""
 CHANGING: Final = ("crossed", "lack", "push")
 """Arrays of an `Interface` that change during a run."""
 CHUNK: Final = 10_000
@@ -222,17 +216,15 @@ def _spheres(case: FlowCase, size_mm: float, cell_size_mm: float) -> Floats:
 def _in(spheres: Floats, points_mm: Floats) -> Bools:
     """Return whether points (n, 3) lie in spheres (m, 4)."""
     result = np.zeros(len(points_mm), dtype=bool)
-    if len(spheres):
-        for inside in cKDTree(points_mm).query_ball_point(spheres[:, :3], spheres[:, 3]):
-            result[inside] = True
+    for inside in cKDTree(points_mm).query_ball_point(spheres[:, :3], spheres[:, 3]) if len(spheres) else ():
+        result[inside] = True
     return result
 
 
-def _box_mm(spheres: Floats, margin_mm: float) -> tuple[Floats, Floats]:
+def _box_mm(spheres: Floats) -> tuple[Floats, Floats]:
     """Return the lowest corner (3,) and the edges (3,) of the box around spheres (m, 4)."""
-    reach_mm = spheres[:, 3:] + margin_mm
-    low_mm = (spheres[:, :3] - reach_mm).min(axis=0)
-    return low_mm, (spheres[:, :3] + reach_mm).max(axis=0) - low_mm
+    low_mm = (spheres[:, :3] - spheres[:, 3:]).min(axis=0)
+    return low_mm, (spheres[:, :3] + spheres[:, 3:]).max(axis=0) - low_mm
 
 
 def further_levels(case: FlowCase, cell_size_mm: float) -> int:
@@ -245,7 +237,7 @@ def further_levels(case: FlowCase, cell_size_mm: float) -> int:
 def box_points(case: FlowCase, size_mm: float) -> float:
     """Return the number of points in the box of the finer grid in branches too narrow for a spacing; 0 without them."""
     narrow = _narrow(case, size_mm)
-    return float((_box_mm(narrow, RIM * size_mm)[1] * WIDTH / size_mm).prod()) if len(narrow) else 0.0
+    return float((_box_mm(narrow)[1] * WIDTH / size_mm).prod()) if len(narrow) else 0.0
 
 
 def _reach_mm(case: FlowCase, size_mm: float, finest_mm: float) -> float:
@@ -301,39 +293,26 @@ def near_wires(case: FlowCase, grid: Domain, finest_mm: float) -> Bools:
     return result
 
 
-def volume_near_wires_mm3(case: FlowCase, size_mm: float, finest_mm: float) -> float:
-    """Estimate the volume of what is refined around wires or a neck on a grid with this spacing."""
-    reach_mm = _reach_mm(case, size_mm, finest_mm) + 1.2 * RIM * size_mm
-    step_mm, corners_mm = reach_mm / 4, _around(case).corners_mm
-    low_mm = corners_mm.min(axis=(0, 1)) - reach_mm - 2 * step_mm
-    at = np.rint((corners_mm.mean(axis=1) - low_mm) / step_mm).astype(int)
-    is_blood = np.ones(at.max(axis=0) + 7, dtype=bool)
-    outside = voxels.fill((case.vessel.closed.corners_mm - low_mm) / step_mm, is_blood.shape)
-    is_blood[tuple(at.T)] = False
-    near = ndimage.distance_transform_edt(is_blood) * step_mm < reach_mm
-    return float((near & outside).sum()) * step_mm**3
-
-
 def volume_mm3(case: FlowCase, size_mm: float, cell_size_mm: float) -> float:
     """Estimate the volume of what is refined on a grid with this spacing (see `refined`)."""
-    result, spheres = 0.0, _spheres(case, size_mm, cell_size_mm)
+    result, spheres, rim_mm = 0.0, _spheres(case, size_mm, cell_size_mm), 1.2 * RIM * size_mm
+    if size_mm == cell_size_mm * WIDTH**case.numerics.coarser_levels:  # finer rims lie in the border of the one before
+        spheres[:, 3] += rim_mm
     if size_mm > cell_size_mm and "sac" in case.numerics.refine:
         diameter_mm = domains.mean_diameter_mm(case.vessel)
         neck_mm2 = 0.0 if case.ostium is None else case.ostium.area_mm2
         stretch_mm = (UPSTREAM_DIAMETERS + DOWNSTREAM_DIAMETERS) * diameter_mm + sqrt(4 / pi * neck_mm2)
         result += abs(require_sac(case).volume_mm3) + pi / 4 * diameter_mm**2 * (stretch_mm + 2 * RIM * size_mm)
     elif size_mm > around_wires_mm(case):
-        result += volume_near_wires_mm3(case, size_mm, cell_size_mm / WIDTH ** wire_levels(case, cell_size_mm))
+        reach_mm = _reach_mm(case, size_mm, cell_size_mm / WIDTH ** wire_levels(case, cell_size_mm)) + rim_mm
+        at = np.unique(np.rint(_around(case).corners_mm.mean(axis=1) / (0.25 * reach_mm)), axis=0) * 0.25 * reach_mm
+        spheres = np.concatenate([spheres, np.column_stack([at, np.full(len(at), reach_mm)])])
     if len(spheres):
-        low_mm, edges_mm = _box_mm(spheres, RIM * size_mm)
-        step_mm = max(size_mm, float(np.cbrt(edges_mm.prod() / SAMPLES)))
+        low_mm, edges_mm = _box_mm(spheres)
+        step_mm = max(size_mm, 0.01 * float(np.cbrt(edges_mm.prod())))  # at most a million points
         x, y, z = np.ceil(edges_mm / step_mm).astype(int)
-        blood = voxels.fill((case.vessel.closed.corners_mm - low_mm) / step_mm, (x, y, z))
-        cells, chosen = np.argwhere(blood), np.zeros_like(blood)
-        chosen[tuple(cells[_in(spheres, low_mm + step_mm * cells)].T)] = True
-        if size_mm == cell_size_mm * WIDTH**case.numerics.coarser_levels:  # finer rims lie in the border before
-            chosen = ndimage.binary_dilation(chosen, FULL, round(RIM * size_mm / step_mm) or 1, mask=blood)
-        result += float(chosen.sum()) * step_mm**3
+        blood = np.argwhere(voxels.fill((case.vessel.closed.corners_mm - low_mm) / step_mm, (x, y, z)))
+        result += float(_in(spheres, low_mm + step_mm * blood).sum()) * step_mm**3
     return min(result, domains.extended_volume_mm3(case.vessel))
 
 
@@ -343,23 +322,23 @@ def window(grid: Domain, is_wanted: Bools, is_outer: Bools | None = None) -> tup
     It keeps away from the cells (n,) of the grid that are outside the border with a coarser one, and of those carried.
     The layer is 0 outside the part; `CARRIED_UP` and deeper ones have the same number.
     """
-    blood, shape = grid.index >= 0, grid.index.shape
-    within, ends = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+    full, shape = np.ones((3, 3, 3), dtype=bool), grid.index.shape
+    blood, within, ends = grid.index >= 0, np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
     within[tuple(grid.cells[is_wanted].T)] = True
     ends[tuple(grid.cells[grid.link_cell[grid.link_patch > 0]].T)] = True
-    within = ndimage.binary_dilation(within, FULL, RIM, mask=blood)
-    within &= ~ndimage.binary_dilation(ends, FULL, OPENING_CELLS)
+    within = ndimage.binary_dilation(within, full, RIM, mask=blood)
+    within &= ~ndimage.binary_dilation(ends, full, OPENING_CELLS)
     if is_outer is not None:
         ends[:] = False
         ends[tuple(grid.cells[is_outer].T)] = True
-        within &= ~ndimage.binary_dilation(ends, FULL, BORDER)
+        within &= ~ndimage.binary_dilation(ends, full, WIDTH * len(CARRIED_UP) + 1)
     if not within.any():
         raise domains.CoarseGridError("no cell is left to be refined")
     front = blood & ~within
-    within |= ndimage.binary_dilation(within, FULL) & ~blood  # finer cells may lie between coarser ones and the wall
+    within |= ndimage.binary_dilation(within, full) & ~blood  # finer cells may lie between coarser ones and the wall
     layer = np.where(within, CARRIED_UP[-1] + 1, 0)
     for number in range(1, CARRIED_UP[-1] + 1):
-        front = ndimage.binary_dilation(front & blood, FULL) & (layer > CARRIED_UP[-1])
+        front = ndimage.binary_dilation(front & blood, full) & (layer > CARRIED_UP[-1])
         layer[front] = number
     low, high = np.argwhere(within).min(axis=0) - 1, np.argwhere(within).max(axis=0) + 2
     part = np.pad(within, 1)[tuple(slice(a, b) for a, b in zip(low + 1, high + 1, strict=True))]

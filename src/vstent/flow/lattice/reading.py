@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vstent.deployment.struts import thickness_mm
-from vstent.flow import domain as domains, sampling
+from vstent.flow import domain as domains
 from vstent.flow.case import FlowField, Level, Phase
 from vstent.flow.ends import outflows
 from vstent.flow.engines import Outcome
@@ -160,13 +160,12 @@ def _remarks(state: State, levels: Sequence[Level], phases: Sequence[Phase]) -> 
             "cells in gaps narrower than a cell are closed."
         )
     elif case.has_screen and case.ostium is not None:
-        finest_mm = sampling.spacing_mm([one.domain for one in state.levels], case.ostium.vertices_mm)
-        across = neck_diameter_mm(case.ostium) / finest_mm
+        across = neck_diameter_mm(case.ostium) / finest.cell_size_mm
         if across < FEWEST_ACROSS_NECK:
             remarks += (
                 f" Under-resolved neck: it has {across:.0f} cells across. With fewer than {FEWEST_ACROSS_NECK} behind "
                 "a dense braid, neck inflow and sac velocity are up to a third too high: use a grid spacing of "
-                f"{across / FEWEST_ACROSS_NECK * finest_mm:.2g} mm or, on the processor, leave it open."
+                f"{across / FEWEST_ACROSS_NECK * finest.cell_size_mm:.2g} mm or, on the processor, leave it open."
             )
     if len(state.levels) > 1:
         sizes = ", ".join(f"{one.domain.cell_size_mm:.3g} mm ({len(one.domain.cells):,} cells)" for one in state.levels)
