@@ -338,8 +338,11 @@ def window(grid: Domain, is_wanted: Bools, is_outer: Bools | None = None) -> tup
     within |= ndimage.binary_dilation(within, full) & ~blood  # finer cells may lie between coarser ones and the wall
     layer = np.where(within, CARRIED_UP[-1] + 1, 0)
     for number in range(1, CARRIED_UP[-1] + 1):
-        front = ndimage.binary_dilation(front & blood, full) & (layer > CARRIED_UP[-1])
+        front = ndimage.binary_dilation(front, full) & (layer > CARRIED_UP[-1])
         layer[front] = number
+    outside, _ = ndimage.label(blood & (layer < OWN_LAYER), full)
+    behind_wall = (outside > 0) & ~np.isin(outside, outside[layer == 0])
+    layer[behind_wall | (ndimage.binary_dilation(behind_wall, full) & within & ~blood)] = CARRIED_UP[-1] + 1
     low, high = np.argwhere(within).min(axis=0) - 1, np.argwhere(within).max(axis=0) + 2
     part = np.pad(within, 1)[tuple(slice(a, b) for a, b in zip(low + 1, high + 1, strict=True))]
     fine = part.repeat(WIDTH, axis=0).repeat(WIDTH, axis=1).repeat(WIDTH, axis=2)
