@@ -221,12 +221,6 @@ def _in(spheres: Floats, points_mm: Floats) -> Bools:
     return result
 
 
-def _box_mm(spheres: Floats) -> tuple[Floats, Floats]:
-    """Return the lowest corner (3,) and the edges (3,) of the box around spheres (m, 4)."""
-    low_mm = (spheres[:, :3] - spheres[:, 3:]).min(axis=0)
-    return low_mm, (spheres[:, :3] + spheres[:, 3:]).max(axis=0) - low_mm
-
-
 def further_levels(case: FlowCase, cell_size_mm: float) -> int:
     """Return the number of levels finer than the grid spacing that narrow branches get."""
     most = FURTHER if "branches" in case.numerics.refine else 0
@@ -236,8 +230,9 @@ def further_levels(case: FlowCase, cell_size_mm: float) -> int:
 
 def box_points(case: FlowCase, size_mm: float) -> float:
     """Return the number of points in the box of the finer grid in branches too narrow for a spacing; 0 without them."""
-    narrow = _narrow(case, size_mm)
-    return float((_box_mm(narrow)[1] * WIDTH / size_mm).prod()) if len(narrow) else 0.0
+    at_mm, reach_mm = np.split(_narrow(case, size_mm), [3], axis=1)
+    edges_mm = np.ptp([*at_mm - reach_mm, *at_mm + reach_mm], axis=0) if len(at_mm) else np.zeros(3)
+    return float((edges_mm * WIDTH / size_mm).prod())
 
 
 def _reach_mm(case: FlowCase, size_mm: float, finest_mm: float) -> float:
@@ -308,7 +303,8 @@ def volume_mm3(case: FlowCase, size_mm: float, cell_size_mm: float) -> float:
         at = np.unique(np.rint(_around(case).corners_mm.mean(axis=1) / (0.25 * reach_mm)), axis=0) * 0.25 * reach_mm
         spheres = np.concatenate([spheres, np.column_stack([at, np.full(len(at), reach_mm)])])
     if len(spheres):
-        low_mm, edges_mm = _box_mm(spheres)
+        low_mm = (spheres[:, :3] - spheres[:, 3:]).min(axis=0)
+        edges_mm = (spheres[:, :3] + spheres[:, 3:]).max(axis=0) - low_mm
         step_mm = max(size_mm, 0.01 * float(np.cbrt(edges_mm.prod())))  # at most a million points
         x, y, z = np.ceil(edges_mm / step_mm).astype(int)
         blood = np.argwhere(voxels.fill((case.vessel.closed.corners_mm - low_mm) / step_mm, (x, y, z)))
