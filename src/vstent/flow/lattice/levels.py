@@ -291,8 +291,8 @@ def near_wires(case: FlowCase, grid: Domain, finest_mm: float) -> Bools:
 def volume_mm3(case: FlowCase, size_mm: float, cell_size_mm: float) -> float:
     """Estimate the volume of what is refined on a grid with this spacing (see `refined`)."""
     result, spheres, rim_mm = 0.0, _spheres(case, size_mm, cell_size_mm), 1.2 * RIM * size_mm
-    if size_mm == cell_size_mm * WIDTH**case.numerics.coarser_levels:  # finer rims lie in the border of the one before
-        spheres[:, 3] += rim_mm
+    if "sac" not in case.numerics.refine and size_mm == cell_size_mm * WIDTH**case.numerics.coarser_levels:
+        spheres[:, 3] += rim_mm  # elsewhere rims lie in the border of the level before, or in the artery near the sac
     if size_mm > cell_size_mm and "sac" in case.numerics.refine:
         diameter_mm = domains.mean_diameter_mm(case.vessel)
         neck_mm2 = 0.0 if case.ostium is None else case.ostium.area_mm2
