@@ -836,7 +836,7 @@ def test_what_cannot_be_chosen_on_the_page_stays_as_the_study_had_it(flown, tmp_
     with app_case.served(tmp_path / "cases", folder) as client:
         case = f"/api/cases/{client.get('/api/cases').json()['opened']}"
         view = client.get(case).json()
-        unseen = {"flow blood viscosity 0.00350\u202fPa·s", "flow blood thinning", "flow numerics close up yes"}
+        unseen = {"flow blood viscosity 0.00350\u202fPa·s", "flow blood thinning", "flow numerics refine"}
         assert unseen < set(view["unseen"])
         assert client.get("/api/waveform", params={"case_id": case.rpartition("/")[2]}).json()["time_s"][-1] == 0.8
         choose(client, case, flow=view["choices"]["flow"] | {"inflow_mL_s": 2.0}, treatments=[alone("enterprise")])
