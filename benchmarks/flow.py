@@ -5,7 +5,7 @@ Usage: python benchmarks/flow.py [--cost] [--pulse] [SURFACE] [CELL_MM ...]
 Besides: how a step's time grows with its cells, and what other machines would need (computed). Seconds of the clock
 depend on what else the machine does: processor seconds stand beside them. With ``--cost`` the demo is computed, steady,
 bare and with Silk and Enterprise as screens, in cells of 0.1 mm, all over and then in the sac and near it only
-(`FlowSettings.close_up`). With ``--pulse`` it is computed bare for two cycles of a pulse, in both ways. With a surface
+(`Numerics.refine`). With ``--pulse`` it is computed bare for two cycles of a pulse, in both ways. With a surface
 file, in mm, that artery is, in the latter way alone.
 """
 
@@ -29,7 +29,7 @@ from vstent.flow.indices import indices
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.stepping import advance
 from vstent.flow.problem import flow_case, vessel_case
-from vstent.flow.settings import FlowSettings, Numerics
+from vstent.flow.settings import FlowSettings, Numerics, Region
 from vstent.flow.simulation import simulate, simulate_case
 from vstent.flow.waveform import OLDER_ADULT_ICA
 from vstent.geometry.vessel import Anatomy, Vessel
@@ -119,29 +119,27 @@ def anatomy_of(surface: Path | None) -> Anatomy:
     return restore(trim(trace(Vessel(lumen))))
 
 
-def cost(surface: Path | None, *, close_up: bool) -> None:
+def cost(surface: Path | None, *, refine: tuple[Region, ...]) -> None:
     """Print what an artery takes, steady, bare and with both devices."""
     anatomy = anatomy_of(surface)
     deployments = [None, *(vstent.deploy(name, anatomy) for name in ("silk", "enterprise"))]
-    settings = FlowSettings(numerics=Numerics(cell_size_mm=0.1, close_up=close_up))
+    settings = FlowSettings(numerics=Numerics(cell_size_mm=0.1, refine=refine))
     began, began_core = time.perf_counter(), time.process_time()
     fields = simulate(anatomy, deployments, settings, progress=tell)
     clock_s, core_s = time.perf_counter() - began, time.process_time() - began_core
-    print(f"\n{named(surface, close_up=close_up)}:\n")
+    print(f"\n{named(surface, refine=refine)}:\n")
     case = flow_case(anatomy, (), settings)
     table(case, dict(zip(("bare", "silk", "enterprise"), fields, strict=True)), clock_s, core_s)
 
 
-def pulse(surface: Path | None, *, close_up: bool) -> None:
+def pulse(surface: Path | None, *, refine: tuple[Region, ...]) -> None:
     """Print what two cycles take in an artery."""
-    settings = FlowSettings(
-        waveform=OLDER_ADULT_ICA, numerics=Numerics(cell_size_mm=0.1, max_cycles=2, close_up=close_up)
-    )
+    settings = FlowSettings(waveform=OLDER_ADULT_ICA, numerics=Numerics(cell_size_mm=0.1, max_cycles=2, refine=refine))
     case = flow_case(anatomy_of(surface), (), settings)
     began, began_core = time.perf_counter(), time.process_time()
     field = simulate_case(case, progress=tell)
     clock_s, core_s = time.perf_counter() - began, time.process_time() - began_core
-    print(f"\n{named(surface, close_up=close_up)}, two cycles of a pulse:\n")
+    print(f"\n{named(surface, refine=refine)}, two cycles of a pulse:\n")
     table(case, {"bare, mean of the second": field}, clock_s, core_s)
     print(field.advice)
 
@@ -151,10 +149,10 @@ def tell(now: Progress) -> None:
     print(f"\r{now.fraction:4.0%}, {now.seconds_left / 60:.1f} min left ", end="", file=sys.stderr, flush=True)
 
 
-def named(surface: Path | None, *, close_up: bool) -> str:
+def named(surface: Path | None, *, refine: tuple[Region, ...]) -> str:
     """What is computed, in words."""
     name = "demo" if surface is None else surface.stem
-    return f"{name}, cells of 0.1 mm{' in the sac and near it' if close_up else ''}"
+    return f"{name}, cells of 0.1 mm{' in the sac and near it' if refine else ''}"
 
 
 def table(case: FlowCase, fields: dict[str, FlowField], clock_s: float, core_s: float) -> None:
@@ -212,8 +210,8 @@ if __name__ == "__main__":
     print("\n| cells a diameter | velocity | pressure gradient | WSS | mass | seconds |\n|---|---|---|---|---|---|")
     for cell_mm in cells_mm:
         poiseuille(cell_mm)
-    for close_up in (False, True) if surface is None else (True,):
+    for refine in ((), ("sac",)) if surface is None else (("sac",),):
         if "--cost" in sys.argv:
-            cost(surface, close_up=close_up)
+            cost(surface, refine=refine)
         if "--pulse" in sys.argv:
-            pulse(surface, close_up=close_up)
+            pulse(surface, refine=refine)

@@ -829,14 +829,14 @@ def test_what_cannot_be_chosen_on_the_page_stays_as_the_study_had_it(flown, tmp_
     folder, told = flown
     pulse = Waveform(0.8, (0.2,), (0.1,))
     blood = Blood(1050.0, 0.0035, CarreauYasuda())
-    flow = FlowSettings(inflow_mL_s=1.0, blood=blood, waveform=pulse, numerics=Numerics(close_up=True))
+    flow = FlowSettings(inflow_mL_s=1.0, blood=blood, waveform=pulse, numerics=Numerics(refine=("sac",)))
     given = replace(settings_of(told["settings"]), flow=flow, uncertainty=Ranges(16, landing_mm=2.0))
     told["settings"] = asdict(given)
     (folder / "run.json").write_text(json.dumps(told))
     with app_case.served(tmp_path / "cases", folder) as client:
         case = f"/api/cases/{client.get('/api/cases').json()['opened']}"
         view = client.get(case).json()
-        unseen = {"flow blood viscosity 0.00350\u202fPa·s", "flow blood thinning", "flow numerics close up yes"}
+        unseen = {"flow blood viscosity 0.00350\u202fPa·s", "flow blood thinning", "flow numerics refine"}
         assert unseen < set(view["unseen"])
         assert client.get("/api/waveform", params={"case_id": case.rpartition("/")[2]}).json()["time_s"][-1] == 0.8
         choose(client, case, flow=view["choices"]["flow"] | {"inflow_mL_s": 2.0}, treatments=[alone("enterprise")])

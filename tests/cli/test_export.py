@@ -163,7 +163,7 @@ def test_an_openfoam_case_holds_one_treatment(
     [
         (["--layers", "-3"], "give at least 0"),
         (["--engine", "nonsense"], "unrecognized"),
-        (["--refine-sac"], "unrecognized"),
+        (["--refine", "sac"], "unrecognized"),
         (["--gpu"], "unrecognized"),
     ],
 )

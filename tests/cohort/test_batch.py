@@ -35,7 +35,7 @@ from vstent.cohort.cases import COLUMNS, find_cases
 from vstent.cohort.estimate import START_CPU_S, estimate
 from vstent.devices.treatment import with_device
 from vstent.errors import FlowError, InputError, ReadError, VstentError
-from vstent.flow.settings import FlowSettings
+from vstent.flow.settings import FlowSettings, Numerics
 from vstent.io.tables import write_parquet, write_rows
 from vstent.io.writers import write_stl
 from vstent.reporting.cohort import cohort_report, modified_z_scores
@@ -318,6 +318,10 @@ def test_an_estimate_grows_with_cases_devices_and_flow_and_heeds_memory(scans, m
     assert all_three.cpu_s > 2 * one.cpu_s
     flowing = [replace(case, settings=replace(SETTINGS, flow=FlowSettings())) for case in cases]
     assert estimate(flowing, 2).cpu_s > 10 * all_three.cpu_s
+    calibrated = FlowSettings(numerics=Numerics(wires="calibrated"))
+    in_rounds = [replace(case, settings=replace(SETTINGS, flow=calibrated)) for case in cases]
+    of_flows = [estimate(those, 2).cpu_s - all_three.cpu_s for those in (flowing, in_rounds)]
+    assert of_flows[1] == pytest.approx(7 / 3 * of_flows[0])  # each of two devices has two rounds besides
     monkeypatch.setattr(sys.modules["vstent.cohort.estimate"], "free_memory_bytes", lambda: 3.5e6 * one.memory_MB)
     assert estimate(cases[:1], 8).jobs == 3
 

@@ -289,12 +289,12 @@ def test_a_pulse_enters_by_all_inlets_at_once() -> None:
     np.testing.assert_allclose([phase.inlets_mL_s for phase in field.phases], expected_mL_s, rtol=0.01)
 
 
-def test_a_close_up_takes_in_what_every_inlet_brings() -> None:
+def test_refinement_in_the_sac_takes_in_what_every_inlet_brings() -> None:
     anatomy = restore(joined(sac_at_mm=5.0))
     settings = FlowSettings(inflow_mL_s=3.0, numerics=Numerics(cell_size_mm=0.2))
     whole, close = (
-        simulate_case(flow_case(anatomy, (), replace(settings, numerics=replace(settings.numerics, close_up=close_up))))
-        for close_up in (False, True)
+        simulate_case(flow_case(anatomy, (), replace(settings, numerics=replace(settings.numerics, refine=refine))))
+        for refine in ((), ("sac",))
     )
     np.testing.assert_allclose(close.inlets_mL_s, whole.inlets_mL_s, rtol=5e-3)
     sac = anatomy.aneurysms[0]

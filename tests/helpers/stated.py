@@ -55,7 +55,10 @@ STATED = {
     "windkessel-time": ("0.5", Settings(flow=FlowSettings(compliance_time_s=0.5))),
     "windkessel-proximal": ("0.1", Settings(flow=FlowSettings(proximal_fraction=0.1))),
     "grid-spacing": ("0.2", Settings(flow=FlowSettings(numerics=Numerics(cell_size_mm=0.2)))),
-    "refine-sac": ("true", Settings(flow=FlowSettings(numerics=Numerics(close_up=True)))),
+    "refine": (
+        "sac; branches; 1,-2,3.5,4",
+        Settings(flow=FlowSettings(numerics=Numerics(refine=("sac", "branches", (1.0, -2.0, 3.5, 4.0))))),
+    ),
     "wires": ("resolved", Settings(flow=FlowSettings(numerics=Numerics(wires="resolved")))),
     "engine": ("openfoam", Settings(flow=FlowSettings(numerics=Numerics(engine="openfoam")))),
     "processes": ("2", Settings(flow=FlowSettings(numerics=Numerics(processes=2)))),

@@ -16,7 +16,7 @@ from vstent.flow import sampling
 from vstent.flow.case import FlowField, Phase
 from vstent.flow.openfoam import scatter
 from vstent.flow.problem import flow_case
-from vstent.flow.settings import FlowSettings, Numerics
+from vstent.flow.settings import FlowSettings, Numerics, Region
 from vstent.flow.simulation import simulate_case
 from vstent.geometry.vessel import Anatomy, Vessel
 
@@ -41,8 +41,8 @@ def uniform(anatomy: Anatomy) -> FlowField:
     return flow(anatomy)
 
 
-def flow(anatomy: Anatomy, spacing_mm: float = SPACING_MM, *, close_up: bool = False) -> FlowField:
-    settings = FlowSettings(inflow_mL_s=2.0, numerics=Numerics(cell_size_mm=spacing_mm, close_up=close_up))
+def flow(anatomy: Anatomy, spacing_mm: float = SPACING_MM, *, refine: tuple[Region, ...] = ()) -> FlowField:
+    settings = FlowSettings(inflow_mL_s=2.0, numerics=Numerics(cell_size_mm=spacing_mm, refine=refine))
     return simulate_case(flow_case(anatomy, (), settings))
 
 
@@ -94,7 +94,7 @@ def test_a_pulse_is_conserved_and_washes_the_sac_as_its_volume_has_passed(anatom
 
 
 def test_contrast_is_conserved_and_bounded_in_a_refined_sac(anatomy: Anatomy) -> None:
-    refined = flow(anatomy, 0.21, close_up=True)  # twice that elsewhere, nearly the coarsest grid of this artery
+    refined = flow(anatomy, 0.21, refine=("sac",))  # twice that elsewhere, nearly the coarsest grid of this artery
     assert sac_curve(anatomy, refined).max() > 0
 
 

@@ -3,7 +3,7 @@
 import argparse
 import re
 from collections.abc import Iterator
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +13,7 @@ from vstent.app.choices import Choices
 from vstent.cli import options
 from vstent.errors import InputError
 from vstent.fields import Option, flag, sections_of
+from vstent.flow.settings import read_region
 from vstent.study.settings import OPTIONS, STATED as PATHS, Settings, settings_of
 
 IN_TEXT = "stated in the text of --treatment"
@@ -46,7 +47,7 @@ NO_FIELD = {
     "uncertainty-flows": "too long for a page",
 } | dict.fromkeys(
     (
-        *("density", "viscosity", "shear-thinning", "refine-sac", "engine", "processes", "gpu"),
+        *("density", "viscosity", "shear-thinning", "refine", "engine", "processes", "gpu"),
         *("vary-threshold", "vary-landing", "vary-device", "vary-inflow", "vary-numbers"),
     ),
     OF_STUDY,
@@ -150,3 +151,15 @@ def test_another_unit_and_two_inflows_are_refused() -> None:
         settings_of({"flow-rate": OPTIONS["flow-rate"].value("27 m/s")})
     with pytest.raises(InputError, match="both state the inflow: leave out one of them"):
         settings_of({"flow-rate": 4.0, "inlet-speed": 0.3})
+
+
+def test_a_ball_is_turned_as_points_are_and_what_names_no_part_is_refused() -> None:
+    refine = read_region(" branches"), read_region("1,-2,3.5,4")
+    settings = settings_of({"frame": "ras", "refine": refine})
+    assert settings.flow is not None
+    assert settings.flow.numerics.refine == ("branches", (-1.0, 2.0, 3.5, 4.0))
+    assert settings.flow.numerics.coarser_levels == 1
+    assert replace(settings.flow.numerics, refine=("branches",)).coarser_levels == 0
+    for text in ("neck", "1,2,3", "1,2,3,4,5"):
+        with pytest.raises(InputError, match=f"'{text}' is no part of a vessel: give sac, branches, or center and"):
+            read_region(text)

@@ -60,7 +60,7 @@ OfFlow: Any = create_model(
     "OfFlow",
     __base__=Strict,
     **offered(FlowSettings, "waveform"),
-    **offered(Numerics, "close_up", "engine", "processes", "device_gpu"),
+    **offered(Numerics, "refine", "engine", "processes", "device_gpu"),
 )
 """Settings of the flow that can be changed on the page."""
 OfVessel: Any = create_model(

@@ -209,7 +209,7 @@ class Workspace:
 
         preview, state = self.preview(case), case.state
         given = state.settings().flow or FlowSettings()
-        settings = replace(given, waveform=None, numerics=replace(given.numerics, close_up=False))
+        settings = replace(given, waveform=None, numerics=replace(given.numerics, refine=()))
         store = BareFlowStore.of(case.folder / CACHE, state.anatomy, settings)
         with self._lock:
             found = self._live_flows.get(case.id)

@@ -16,7 +16,7 @@ def add(commands: options.Commands) -> None:
     text = "Write an OpenFOAM case folder: mesh settings, boundary conditions and scripts (lengths in m)."
     foam = options.add_command(kinds, "openfoam", text, "export openfoam case --device silk --out foam")
     _add_input(foam)
-    unsupported = ("no-flow", "engine", "refine-sac", "gpu")
+    unsupported = ("no-flow", "engine", "refine", "gpu")
     options.add_settings(foam, *options.VESSEL, "treatments", "flow", without=unsupported)
     group = foam.add_argument_group("OpenFOAM")
     text = "openfoam.com or openfoam.org (default: the one installed, else com)"

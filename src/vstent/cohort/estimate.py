@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from vstent.cohort.cases import Case
+from vstent.flow.lattice.calibration import ROUNDS
 from vstent.flow.memory import free_memory_bytes
 from vstent.io.files import is_surface_file, suffix
 from vstent.units import BYTES_PER_MB
@@ -79,8 +80,9 @@ def _cost(case: Case) -> tuple[float, float]:
     memory = START_MB + MB_PER_1000_TRIANGLES * triangles / 1e3 + MB_PER_MILLION_VOXELS * voxels / 1e6
     cpu_s += CPU_S_PER_DEVICE * n_devices
     if case.settings.flow is not None:
-        finer = COMMON_CELL_MM / (case.settings.flow.numerics.cell_size_mm or COMMON_CELL_MM)
-        cells = FLOW_CELLS * finer**3
-        cpu_s += (1 + n_devices) * CPU_S_PER_1000_CELLS * finer * cells / 1e3
+        numerics = case.settings.flow.numerics
+        finer = COMMON_CELL_MM / (numerics.cell_size_mm or COMMON_CELL_MM)
+        cells, rounds = FLOW_CELLS * finer**3, ROUNDS if numerics.wires in ("auto", "calibrated") else 0
+        cpu_s += (1 + n_devices * (1 + rounds)) * CPU_S_PER_1000_CELLS * finer * cells / 1e3
         memory += MB_PER_1000_CELLS * cells / 1e3
     return cpu_s, memory

@@ -111,8 +111,8 @@ def too_narrow(case: FlowCase, cell_size_mm: float) -> str:
     )
     return (
         f" Under-resolved branches: at a grid spacing of {cell_size_mm:.3g} mm, {named} cells across. With fewer than "
-        f"{BRANCH_CELLS:.0f} a branch has too much resistance and carries too little flow: use a finer grid spacing, "
-        "or give the outlets resistances or fixed shares."
+        f"{BRANCH_CELLS:.0f} a branch has too much resistance and carries too little flow: refine them "
+        "(--refine branches), use a finer grid spacing, or give the outlets resistances or fixed shares."
     )
 
 

@@ -73,7 +73,7 @@ class AbstractEngine(ABC, Generic[State]):
     refined_by: ClassVar[tuple[str, ...]] = ("cell_size_mm",)
     """Settings whose reduction makes the result converge; the grid spacing comes first."""
     has_levels: ClassVar[bool] = False
-    """Whether the engine supports a finer grid in a part of the vessel (`Numerics.close_up`)."""
+    """Whether the engine supports a finer grid in a part of the vessel (`Numerics.refine`)."""
     runs_on_gpu: ClassVar[bool] = False
     """Whether the engine supports the setting ``device_gpu``."""
 

@@ -3,14 +3,17 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import reduce
+from math import ceil, log2
 from typing import Any, Final, Literal
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from vstent.devices.treatment import BARE
 from vstent.flow.case import FlowCase, FlowField
-from vstent.flow.domain import mean_diameter_mm
+from vstent.flow.domain import BRANCH_CELLS, mean_diameter_mm
 from vstent.flow.indices import neck_diameter_mm, parent_diameter_mm, residuals
+from vstent.flow.lattice.levels import WIDTH, further_levels
 from vstent.flow.lattice.setup import CELL_REYNOLDS
 from vstent.flow.settings import LATTICE
 from vstent.geometry.surface import Surface
@@ -107,15 +110,17 @@ def grade_of(measures: Mapping[str, float]) -> Grade:
 def measures_of(case: FlowCase, field: FlowField, found: Mapping[str, float]) -> dict[str, float]:
     """Return the measures of a flow that its grade rests on; counts are in cells, fractions from 0 to 1."""
     spacing_mm, outlets = field.finest.cell_size_mm, case.vessel.outlets
-    measures = {"cells_across_parent_count": mean_diameter_mm(case.vessel) / spacing_mm}
+    measures = {"cells_across_parent_count": mean_diameter_mm(case.vessel) / field.levels[0].cell_size_mm}
     if not case.is_split_given:
         shares = zip(outlets, murray_shares(outlets), strict=True)
-        counted_mm = (outlet.diameter_mm for outlet, share in shares if share >= COUNTED_SHARE)
-        measures["cells_across_outlet_count"] = min(counted_mm) / spacing_mm
+        across = min(outlet.diameter_mm for outlet, share in shares if share >= COUNTED_SHARE) / spacing_mm
+        further = min(further_levels(case, spacing_mm), max(0, ceil(log2(BRANCH_CELLS / across))))
+        measures["cells_across_outlet_count"] = across * WIDTH**further
     if np.isfinite(field.unsettled_fraction):
         measures["unsettled_fraction"] = field.unsettled_fraction
     if case.sac is None or case.ostium is None:
         return measures
+    spacing_mm = float(np.median(field.sizes_mm[cKDTree(field.centers_mm).query(case.ostium.vertices_mm)[1]]))
     measures["cells_across_parent_count"] = parent_diameter_mm(case) / spacing_mm
     measures["cells_across_neck_count"] = neck_diameter_mm(case.ostium) / spacing_mm
     measures["cells_across_sac_count"] = float(np.cbrt(6 * abs(case.sac.volume_mm3) / np.pi)) / spacing_mm

@@ -3,12 +3,13 @@
 This module imports no numpy, so that command-line options and settings of a study can be read without it.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
 from vstent.errors import InputError
-from vstent.fields import Limits, flag, flow_rate, numbers, setting, whole
+from vstent.fields import POSITION, Limits, flag, flow_rate, numbers, setting, whole
 from vstent.flow.measured import MeasuredProfile, Profile, read_profile
 from vstent.flow.waveform import PUBLISHED, SOURCES, Waveform, read_waveform
 from vstent.units import PA_PER_MMHG
@@ -20,6 +21,8 @@ Outlets = Literal["zero_pressure", "murray", "split", "resistance", "windkessel"
 """Condition at the outlets."""
 Wires = Literal["auto", "screen", "calibrated", "resolved"]
 """How a flow takes the wires over necks and branches."""
+Region = Literal["sac", "branches"] | tuple[float, float, float, float]
+"""Part of a vessel: a word, or center, LPS, and radius of a ball, mm."""
 RESISTING: Final = ("resistance", "windkessel")
 """Conditions with which the flow out follows the pressure."""
 Elements = tuple[float, float, float]
@@ -32,6 +35,18 @@ OPENFOAM: Final = "openfoam"
 """Name of the engine that runs OpenFOAM, a separate program."""
 HIGH_SHEAR_VISCOSITY_PA_S: Final = 0.00345
 """Viscosity at high shear rate, Pa s, that belongs to the default values of `CarreauYasuda` (Cho and Kensey 1991)."""
+
+
+def read_region(text: str) -> str | tuple[float, ...]:
+    """Return a `Region` read from text."""
+    if (word := text.strip()) in ("sac", "branches"):
+        return word
+    with suppress(InputError):
+        if len(found := numbers(word)) == 4:
+            return found
+    raise InputError(
+        f"{text!r} is no part of a vessel: give sac, branches, or center and radius of a ball in mm, such as 3,-12,8,2"
+    )
 
 
 def read_elements(source: str) -> tuple[Elements, ...]:
@@ -127,10 +142,17 @@ class Numerics:
         None, "grid-spacing", "spacing of the flow grid", limits=Limits("mm", 0.002, 1.0), usual="29 cells per diameter"
     )
     """Grid spacing; None: `cells_per_diameter` cells across the vessel, but at most `cell_budget` cells in all."""
-    close_up: bool = setting(
-        False, "refine-sac", "use the grid spacing only in and near the sac, and twice it elsewhere", flag
+    refine: tuple[Region, ...] = setting(
+        (),
+        "refine",
+        "where the grid is refined: with sac (and the artery near it) or a ball X,Y,Z,R the grid spacing holds only "
+        "there, and twice it elsewhere; with branches, those of fewer than six cells across have down to a quarter",
+        read_region,
+        POSITION,
+        metavar="WHERE",
+        separators=";",
     )
-    """Whether to use this grid spacing only in and near the sac, and twice it elsewhere (see `lattice.levels`)."""
+    """Where the grid is refined (see `lattice.levels`)."""
     wires: Wires = setting(
         "screen",
         "wires",
@@ -155,8 +177,8 @@ class Numerics:
     and the velocity in the sac by less than twice this fraction (root mean square). An unsteady flow has converged
     when the standard error of every time average is smaller than this fraction."""
     max_steps: int = 96_000
-    """Maximum number of time steps of a steady flow on the finest grid kept. With `close_up` at most a third of them,
-    with wires as walls of finer levels an eighth."""
+    """Maximum number of time steps of a steady flow on the finest grid kept. With a coarser level at most a third of
+    them, with wires as walls of finer levels an eighth."""
     max_cycles: int = 4
     """Maximum number of cycles of a pulsatile flow."""
     cycle_tolerance: float = 0.02
@@ -173,6 +195,11 @@ class Numerics:
     """Number of processes on this machine (OpenFOAM only)."""
     device_gpu: bool = setting(False, "gpu", "compute the flow on an NVIDIA GPU (needs the extra gpu)", flag)
     """Whether the embedded engine computes on a GPU (needs the extra ``gpu``); results differ in the last bits."""
+
+    @property
+    def coarser_levels(self) -> int:
+        """Number of levels coarser than the grid spacing: one where it holds only in a part of the vessel."""
+        return int(any(where != "branches" for where in self.refine))
 
 
 @dataclass(frozen=True)

@@ -217,14 +217,14 @@ def engine_class(numerics: Numerics, *, is_pulsatile: bool) -> type[AbstractEngi
             f"The engine {numerics.engine} is incomplete: it lacks {', '.join(sorted(missing))}. Complete its package, "
             f"or choose the engine {LATTICE}."
         )
-    if numerics.close_up and not engine.has_levels:
+    if numerics.refine and not engine.has_levels:
         raise InputError(
-            f"the engine {numerics.engine} does not support a finer grid in the sac alone: switch it off "
-            f"(--refine-sac), or choose the engine {LATTICE}"
+            f"the engine {numerics.engine} does not support a finer grid in a part of the vessel: leave out --refine, "
+            f"or choose the engine {LATTICE}"
         )
-    if (numerics.close_up or numerics.wires in ("calibrated", "resolved")) and numerics.device_gpu:
+    if (numerics.refine or numerics.wires in ("calibrated", "resolved")) and numerics.device_gpu:
         raise InputError(
-            "finer grids in the sac and around wires are not computed on a GPU: leave out --refine-sac and --wires, or "
+            "finer grids in a part of the vessel are not computed on a GPU: leave out --refine and --wires, or "
             "compute on the CPU (without --gpu)"
         )
     if numerics.device_gpu and not engine.runs_on_gpu:
@@ -289,7 +289,7 @@ class _Runs:
             begun = partial(as_screen.answer, _with_wires(case, "screen"), start)
             return self._run("resolved", case, default_cell_size_mm(case), begun, (SCREEN_SHARE, 1.0))
         sizes_mm, coarsening = [default_cell_size_mm(case)], self.engine.coarsening
-        one_level = replace(case.numerics, close_up=False, cells_across_neck=0.0)
+        one_level = replace(case.numerics, refine=(), cells_across_neck=0.0)
         whole = replace(case, numerics=one_level)  # a guess
         if coarsening is not None and self.similar is None and (start is None or case.media):
             volume_mm3 = abs(case.vessel.closed.volume_mm3)

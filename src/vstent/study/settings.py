@@ -215,7 +215,9 @@ def _treatments(given: Mapping[str, Any]) -> tuple[Treatment, ...]:
 
 
 def _from_ras(place_mm: Any) -> Any:
-    """Return a RAS point, or each of several, in LPS."""
-    if isinstance(place_mm[0], tuple):
+    """Return a RAS point or ball, or each of several, in LPS."""
+    if isinstance(place_mm, str):
+        return place_mm
+    if isinstance(place_mm[0], tuple | str):
         return tuple(map(_from_ras, place_mm))
-    return -place_mm[0], -place_mm[1], place_mm[2]
+    return -place_mm[0], -place_mm[1], *place_mm[2:]

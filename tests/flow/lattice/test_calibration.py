@@ -134,7 +134,7 @@ def test_devices_share_the_grids_around_a_neck_and_those_of_walls_do_not_pile_up
     size_mm = default_cell_size_mm(case)
     first, second = (stepping._grids(one, size_mm) for one in (case, other))
     assert first[1][0] is second[1][0]
-    around_sac = with_numerics(replace(case, media=(), solids=()), cell_size_mm=size_mm / 2, close_up=True)
+    around_sac = with_numerics(replace(case, media=(), solids=()), cell_size_mm=size_mm / 2, refine=("sac",))
     assert sizes_mm(around_sac, size_mm / 2) == sizes_mm(case, size_mm)
     assert stepping._grids(around_sac, size_mm / 2)[1][0] is not first[1][0]
     for thickness_um in (300.0, 310.0):  # walls of the grid itself

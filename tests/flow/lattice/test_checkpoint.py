@@ -77,7 +77,7 @@ def computed(kind: str) -> tuple[FlowCase, FlowField | None, FlowField]:
         case = replace(case, media=(screen(),))
     if "close-up" in kind:
         sac = Surface(sphere(1.0).vertices_mm + np.array([0.0, 0.0, 5.0]), sphere(1.0).faces)
-        numerics = replace(settings.numerics, cell_size_mm=0.2, close_up=True)
+        numerics = replace(settings.numerics, cell_size_mm=0.2, refine=("sac",))
         case = replace(case, target=Target(sac, None), numerics=numerics)
     return case, start, simulate_case(case, start=start)
 

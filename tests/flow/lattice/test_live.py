@@ -82,7 +82,7 @@ def settled(live: LiveFlow) -> tuple[float, float]:
 def alone(live: LiveFlow, one: tuple[Sheet, ...]) -> tuple[float, float]:
     """Return neck inflow and sac velocity of a run of its own, in the same coarse flow."""
     engine = LatticeBoltzmann(live.cell_size_mm)
-    fine = replace(case(), media=one, numerics=replace(SETTINGS.numerics, close_up=True, tolerance=1e-3))
+    fine = replace(case(), media=one, numerics=replace(SETTINGS.numerics, refine=("sac",), tolerance=1e-3))
     found = indices(run(engine, fine, start=live.outer), fine.sac, fine.ostium)
     return found["neck_inflow_mL_s"], found["mean_sac_velocity_m_s"]
 

@@ -157,7 +157,7 @@ def _resistance(
         told((reading + 1) / (2 * READINGS))
         if reading >= READINGS:
             velocity_m_s = stepping.snapshots(state)[0].velocity_m_s.astype(np.float64)
-            of_cells = (state.domain.centers_mm, velocity_m_s), forces_N(state.levels[-1])
+            of_cells = (state.domain.centers_mm, velocity_m_s), forces_N(state.at_wires)
             sums = (nearby.sums(nodes_mm, *values, REACH_MM) for values in of_cells)
             along += np.stack([np.einsum("pd,pd->p", one, normals) for one in sums])
     ((through, both), (_, forces)) = (area_mm2 * along) @ along.T

@@ -14,7 +14,7 @@ from vstent.flow.domain import default_cell_size_mm, extended_volume_mm3
 from vstent.flow.lattice.gpu import free_gpu_bytes
 from vstent.flow.lattice.kernels import d3q19, lanes
 from vstent.flow.lattice.kernels.warm import keep_flow
-from vstent.flow.lattice.levels import WIDTH, sizes_mm, volume_mm3, volume_near_wires_mm3
+from vstent.flow.lattice.levels import WIDTH, box_points, further_levels, sizes_mm, volume_mm3
 from vstent.flow.lattice.pace import pace
 from vstent.flow.memory import free_memory_bytes
 from vstent.units import duration
@@ -26,6 +26,9 @@ BYTES_PER_PHASE_AND_CELL = 32
 """Memory in bytes per stored phase of a cycle and cell."""
 BYTES_PER_GRID_POINT = 6
 """Memory in bytes per grid point of the box around the vessel (measured: 3)."""
+BYTES_PER_BOX_POINT = 15
+"""Memory in bytes per grid point of the box around narrow branches, while the finest level there is built (measured on
+83 million points)."""
 MOST_CELLS = 1e8
 """Maximum number of cells whose 19 populations can be addressed with 32 bits, cells beside the wall included (2^31 / 19
 storage places)."""
@@ -82,7 +85,7 @@ def estimate(case: FlowCase) -> Cost:
 
 def seconds_of(case: FlowCase, cell_size_mm: float, steps: float) -> float:
     """Estimate the run time of so many time steps on the finest level."""
-    of_levels, kept = _cells(case, cell_size_mm), 1 + case.numerics.close_up
+    of_levels, kept = _cells(case, cell_size_mm), 1 + case.numerics.coarser_levels
     per_step = np.array(of_levels) * WIDTH ** np.arange(1.0 - len(of_levels), 1.0)
     in_block = WHOLE_OVER_BLOCK * per_step[:kept].sum() + AROUND_WIRES_OVER_BLOCK * per_step[kept:].sum()
     return float(in_block) * steps / block_rate(on_gpu=case.numerics.device_gpu)
@@ -90,10 +93,8 @@ def seconds_of(case: FlowCase, cell_size_mm: float, steps: float) -> float:
 
 def _cells(case: FlowCase, cell_size_mm: float) -> list[float]:
     """Return the number of cells of every level, coarse to fine."""
-    sizes, volumes_mm3 = sizes_mm(case, cell_size_mm), [extended_volume_mm3(case.vessel)]
-    if case.numerics.close_up:
-        volumes_mm3.append(volume_mm3(case, sizes[0]))
-    volumes_mm3 += [volume_near_wires_mm3(case, one_mm, sizes[-1]) for one_mm in sizes[len(volumes_mm3) - 1 : -1]]
+    sizes = sizes_mm(case, cell_size_mm)
+    volumes_mm3 = extended_volume_mm3(case.vessel), *(volume_mm3(case, one_mm, cell_size_mm) for one_mm in sizes[:-1])
     return [volume / size_mm**3 for volume, size_mm in zip(volumes_mm3, sizes, strict=True)]
 
 
@@ -147,13 +148,15 @@ def _size(case: FlowCase, cell_size_mm: float) -> tuple[float, float]:
     widest = max(opening.diameter_mm for opening in vessel.openings)
     box_mm3 = float(np.prod(np.ptp(vessel.lumen.vertices_mm, axis=0) + 2 * widest))
     phases = 0 if case.waveform is None else PHASES
-    of_cell = BYTES_PER_CELL + phases * BYTES_PER_PHASE_AND_CELL
-    return cells, BYTES_AT_LEAST + box_mm3 / cell_size_mm**3 * BYTES_PER_GRID_POINT + cells * of_cell
+    of_cell, further = BYTES_PER_CELL + phases * BYTES_PER_PHASE_AND_CELL, further_levels(case, cell_size_mm)
+    of_boxes = box_mm3 / cell_size_mm**3 * BYTES_PER_GRID_POINT
+    of_boxes += BYTES_PER_BOX_POINT * box_points(case, cell_size_mm * WIDTH / WIDTH**further) * (further > 0)
+    return cells, BYTES_AT_LEAST + of_boxes + cells * of_cell
 
 
 def _steps(case: FlowCase, cell_size_mm: float) -> int:
     """Return the maximum number of time steps on the finest level."""
-    sizes, kept = sizes_mm(case, cell_size_mm), 1 + case.numerics.close_up
+    sizes, kept = sizes_mm(case, cell_size_mm), 1 + case.numerics.coarser_levels
     if case.waveform is None:
         return int(part_of_steps(case, len(sizes)) * case.numerics.max_steps) * WIDTH ** (len(sizes) - kept)
     return WIDTH ** (len(sizes) - 1) * int(pace(case, sizes[0], None).sum()) * case.numerics.max_cycles
@@ -164,8 +167,8 @@ def part_of_steps(case: FlowCase, levels: int) -> float:
 
     It is small where it begins from a flow on the coarsest level, or from the flow with a screen.
     """
-    are_walls = case.numerics.wires == "resolved" and levels > 1 + case.numerics.close_up
-    return 1 / 8 if are_walls else 1 / 3 if case.numerics.close_up else 1.0
+    coarser, are_walls = case.numerics.coarser_levels, case.numerics.wires == "resolved" and case.wires is not None
+    return 1 / 8 if are_walls and levels > 1 + coarser else 1 / 3 if coarser else 1.0
 
 
 @cache

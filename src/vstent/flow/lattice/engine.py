@@ -100,7 +100,7 @@ class LatticeBoltzmann(AbstractLattice):
         """Set up a run whose fastest blood moves `lattice_speed` cells a step."""
         step_s = longest_step_s(case, self.coarsest_mm(case), peak_speed_m_s(case, start))
         check_s = CHECK_DIAMETERS * case.vessel.inlet.diameter_mm * M_PER_MM / float(case.inlet_speeds_m_s[0])
-        most = case.numerics.max_steps / WIDTH**case.numerics.close_up
+        most = case.numerics.max_steps / WIDTH**case.numerics.coarser_levels
         steps = 2 * max(1, round(0.5 * min(check_s / step_s, most / LEAST_CHECKS)))
         kept = 2 * CHECKS_APART + 1
         return stepping.build(case, self.cell_size_mm, steps * step_s, np.array([steps]), start=start, kept=kept)
@@ -127,7 +127,7 @@ class LatticeBoltzmann(AbstractLattice):
     def max_checks(self, state: State) -> int:
         """Return the maximum number of checks within the limit of time steps."""
         steps = part_of_steps(state.case, len(state.levels)) * state.case.numerics.max_steps
-        return max(4, int(steps // state.main.steps_per_check))
+        return max(4, int(steps // state.kept[-1].steps_per_check))
 
     def result(self, state: State, outcome: Outcome) -> FlowField:
         """Return the last check of a converged flow, or the time average of an unsteady one."""

@@ -50,6 +50,7 @@ from vstent.geometry.surface import Surface
 from vstent.kernels import voxels
 from vstent.kernels.arrays import Bools, Floats, Ints
 from vstent.kernels.directions import VELOCITIES
+from vstent.units import place
 
 WIDTH: Final = 2
 """Ratio of the grid spacings of two levels, and of their time steps."""
@@ -76,6 +77,10 @@ BESIDE_NECK: Final = 6.0
 MARGIN_CELLS: Final = 14.0
 """Distance in cells by which a refined part around wires exceeds the next finer one: with less, the distance kept from
 the border and `RIM` leave no room for that along diagonals."""
+FURTHER: Final = 2
+"""Most levels below the grid spacing that narrow branches get."""
+MOST_POINTS: Final = 1e8
+"""Most grid points in the box around narrow branches on such a level: 1.5 GB (see `cost.BYTES_PER_BOX_POINT`)."""
 SCREEN_CELLS: Final = 4.0
 """Distance in cells from a neck with a screen, which is spread over layers of cells, up to which a grid is refined."""
 CHANGING: Final = ("crossed", "lack", "push")
@@ -154,9 +159,7 @@ class Interface:
 def require_sac(case: FlowCase) -> Surface:
     """Return the sac of a case, around which the grid is refined; raise a `FlowError` where there is none."""
     if case.sac is None:
-        raise FlowError(
-            "the grid cannot be refined in the sac, because this vessel has none: switch that off (--refine-sac)"
-        )
+        raise FlowError("the grid cannot be refined in the sac, because this vessel has none: leave out --refine sac")
     return case.sac
 
 
@@ -181,29 +184,55 @@ def near_sac(case: FlowCase, grid: Domain) -> Bools:
     return is_near | (is_upstream & (distance_mm <= UPSTREAM_DIAMETERS * diameter_mm))
 
 
-def _narrow(case: FlowCase, size_mm: float) -> tuple[Floats, Floats, Floats]:
-    """Return the points (m, 3) of centerlines in branches too narrow for a grid, their radii (m,), and steps (m,).
+def _balls(case: FlowCase, size_mm: float) -> Floats:
+    """Return centers and radii (b, 4) of the balls to be refined, each wide enough for a cell of this size."""
+    balls = np.array([one for one in case.numerics.refine if not isinstance(one, str)], dtype=float).reshape(-1, 4)
+    away_mm = case.vessel.closed.signed_distance(balls[:, :3])
+    for x, y, z, radius_mm in balls[away_mm >= balls[:, 3]]:
+        raise FlowError(
+            f"the ball of {radius_mm:.3g} mm around {place(np.array([x, y, z]))} in which the grid is to be refined "
+            "holds no blood: move it into the vessel (--refine X,Y,Z,R)"
+        )
+    balls[:, 3] = np.maximum(balls[:, 3], np.maximum(away_mm, 0.0) + size_mm)
+    return balls
 
-    There are none where the flow through a branch does not depend on its resistance.
-    """
+
+def _narrow(case: FlowCase, size_mm: float) -> Floats:
+    """Return centers and radii (m, 4) of spheres along branches too narrow for a grid, if their resistance matters."""
     lines = () if case.is_split_given else case.vessel.centerlines
-    columns = [
-        np.column_stack([one.points_mm, one.inscribed_radius_mm, np.gradient(one.abscissa_mm)])[
-            2 * one.inscribed_radius_mm < domains.BRANCH_CELLS * size_mm
-        ]
-        for one in lines
-    ]
-    found = np.concatenate([np.zeros((0, 5)), *columns])
-    return found[:, :3], found[:, 3], found[:, 4]
+    spheres = [np.column_stack([one.points_mm, 1.5 * one.inscribed_radius_mm]) for one in lines]
+    found = np.concatenate([np.zeros((0, 4)), *spheres])
+    return found[2 * found[:, 3] < 1.5 * domains.BRANCH_CELLS * size_mm]
 
 
-def near_narrow(case: FlowCase, grid: Domain) -> Bools:
-    """Return whether each cell (n,) lies in a branch too narrow for the grid."""
-    points_mm, radius_mm, _ = _narrow(case, grid.cell_size_mm)
-    if not len(points_mm):
-        return np.zeros(len(grid.cells), dtype=bool)
-    away_mm, nearest = cKDTree(points_mm).query(grid.centers_mm)
-    return away_mm < 1.5 * radius_mm[nearest]
+def _spheres(case: FlowCase, size_mm: float, cell_size_mm: float) -> Floats:
+    """Return centers and radii (m, 4) of balls, and along narrow branches, refined on a grid with this spacing."""
+    parts = [_balls(case, size_mm)] if size_mm > cell_size_mm else []
+    if size_mm > 1.5 * cell_size_mm / WIDTH ** further_levels(case, cell_size_mm):
+        parts.append(_narrow(case, size_mm))
+    return np.concatenate([np.zeros((0, 4)), *parts])
+
+
+def _in(spheres: Floats, points_mm: Floats) -> Bools:
+    """Return whether points (n, 3) lie in spheres (m, 4)."""
+    result = np.zeros(len(points_mm), dtype=bool)
+    for inside in cKDTree(points_mm).query_ball_point(spheres[:, :3], spheres[:, 3]) if len(spheres) else ():
+        result[inside] = True
+    return result
+
+
+def further_levels(case: FlowCase, cell_size_mm: float) -> int:
+    """Return the number of levels finer than the grid spacing that narrow branches get."""
+    most = FURTHER if "branches" in case.numerics.refine else 0
+    fits = (0 < box_points(case, cell_size_mm / WIDTH**count) < MOST_POINTS for count in range(most))
+    return next((count for count, fits_too in enumerate(fits) if not fits_too), most)
+
+
+def box_points(case: FlowCase, size_mm: float) -> float:
+    """Return the number of points in the box of the finer grid in branches too narrow for a spacing; 0 without them."""
+    at_mm, reach_mm = np.split(_narrow(case, size_mm), [3], axis=1)
+    edges_mm = np.ptp([*at_mm - reach_mm, *at_mm + reach_mm], axis=0) if len(at_mm) else np.zeros(3)
+    return float((edges_mm * WIDTH / size_mm).prod())
 
 
 def _reach_mm(case: FlowCase, size_mm: float, finest_mm: float) -> float:
@@ -259,29 +288,28 @@ def near_wires(case: FlowCase, grid: Domain, finest_mm: float) -> Bools:
     return result
 
 
-def volume_near_wires_mm3(case: FlowCase, size_mm: float, finest_mm: float) -> float:
-    """Estimate the volume of what is refined around wires or a neck on a grid with this spacing."""
-    reach_mm = _reach_mm(case, size_mm, finest_mm) + 1.2 * RIM * size_mm
-    step_mm, corners_mm = reach_mm / 4, _around(case).corners_mm
-    low_mm = corners_mm.min(axis=(0, 1)) - reach_mm - 2 * step_mm
-    at = np.rint((corners_mm.mean(axis=1) - low_mm) / step_mm).astype(int)
-    is_blood = np.ones(at.max(axis=0) + 7, dtype=bool)
-    outside = voxels.fill((case.vessel.closed.corners_mm - low_mm) / step_mm, is_blood.shape)
-    is_blood[tuple(at.T)] = False
-    near = ndimage.distance_transform_edt(is_blood) * step_mm < reach_mm
-    return float((near & outside).sum()) * step_mm**3
-
-
-def volume_mm3(case: FlowCase, coarse_mm: float) -> float:
-    """Estimate the volume of the refined part of a case: the sac, a piece of the artery, and narrow branches."""
-    sac, diameter_mm = require_sac(case), domains.mean_diameter_mm(case.vessel)
-    neck_mm2 = 0.0 if case.ostium is None else case.ostium.area_mm2
-    stretch_mm = (UPSTREAM_DIAMETERS + DOWNSTREAM_DIAMETERS) * diameter_mm + sqrt(4 / pi * neck_mm2)
-    stretch_mm += 2 * RIM * coarse_mm
-    _, radius_mm, step_mm = _narrow(case, coarse_mm)
-    branches_mm3 = float((pi * radius_mm**2 * step_mm).sum())
-    wanted_mm3 = abs(sac.volume_mm3) + pi / 4 * diameter_mm**2 * stretch_mm + branches_mm3
-    return min(wanted_mm3, abs(case.vessel.closed.volume_mm3))
+def volume_mm3(case: FlowCase, size_mm: float, cell_size_mm: float) -> float:
+    """Estimate the volume of what is refined on a grid with this spacing (see `refined`)."""
+    result, spheres, rim_mm = 0.0, _spheres(case, size_mm, cell_size_mm), 1.2 * RIM * size_mm
+    if "sac" not in case.numerics.refine and size_mm == cell_size_mm * WIDTH**case.numerics.coarser_levels:
+        spheres[:, 3] += rim_mm  # elsewhere rims lie in the border of the level before, or in the artery near the sac
+    if size_mm > cell_size_mm and "sac" in case.numerics.refine:
+        diameter_mm = domains.mean_diameter_mm(case.vessel)
+        neck_mm2 = 0.0 if case.ostium is None else case.ostium.area_mm2
+        stretch_mm = (UPSTREAM_DIAMETERS + DOWNSTREAM_DIAMETERS) * diameter_mm + sqrt(4 / pi * neck_mm2)
+        result += abs(require_sac(case).volume_mm3) + pi / 4 * diameter_mm**2 * (stretch_mm + 2 * RIM * size_mm)
+    elif size_mm > around_wires_mm(case):
+        reach_mm = _reach_mm(case, size_mm, cell_size_mm / WIDTH ** wire_levels(case, cell_size_mm)) + rim_mm
+        at = np.unique(np.rint(_around(case).corners_mm.mean(axis=1) / (0.25 * reach_mm)), axis=0) * 0.25 * reach_mm
+        spheres = np.concatenate([spheres, np.column_stack([at, np.full(len(at), reach_mm)])])
+    if len(spheres):
+        low_mm = (spheres[:, :3] - spheres[:, 3:]).min(axis=0)
+        edges_mm = (spheres[:, :3] + spheres[:, 3:]).max(axis=0) - low_mm
+        step_mm = max(size_mm, 0.01 * float(np.cbrt(edges_mm.prod())))  # at most a million points
+        x, y, z = np.ceil(edges_mm / step_mm).astype(int)
+        blood = np.argwhere(voxels.fill((case.vessel.closed.corners_mm - low_mm) / step_mm, (x, y, z)))
+        result += float(_in(spheres, low_mm + step_mm * blood).sum()) * step_mm**3
+    return min(result, domains.extended_volume_mm3(case.vessel))
 
 
 def window(grid: Domain, is_wanted: Bools, is_outer: Bools | None = None) -> tuple[Window, Ints]:
@@ -300,27 +328,40 @@ def window(grid: Domain, is_wanted: Bools, is_outer: Bools | None = None) -> tup
         ends[:] = False
         ends[tuple(grid.cells[is_outer].T)] = True
         within &= ~ndimage.binary_dilation(ends, full, WIDTH * len(CARRIED_UP) + 1)
+    if not within.any():
+        raise domains.CoarseGridError("no cell is left to be refined")
     front = blood & ~within
     within |= ndimage.binary_dilation(within, full) & ~blood  # finer cells may lie between coarser ones and the wall
     layer = np.where(within, CARRIED_UP[-1] + 1, 0)
     for number in range(1, CARRIED_UP[-1] + 1):
         front = ndimage.binary_dilation(front, full) & (layer > CARRIED_UP[-1])
         layer[front] = number
-    low = np.argwhere(within).min(axis=0) - 1
-    part = within[tuple(slice(a, b) for a, b in zip(low, np.argwhere(within).max(axis=0) + 2, strict=True))]
+    outside, _ = ndimage.label(blood & (layer < OWN_LAYER), full)
+    behind_wall = (outside > 0) & ~np.isin(outside, outside[layer == 0])
+    layer[behind_wall | (ndimage.binary_dilation(behind_wall, full) & within & ~blood)] = CARRIED_UP[-1] + 1
+    low, high = np.argwhere(within).min(axis=0) - 1, np.argwhere(within).max(axis=0) + 2
+    part = np.pad(within, 1)[tuple(slice(a, b) for a, b in zip(low + 1, high + 1, strict=True))]
     fine = part.repeat(WIDTH, axis=0).repeat(WIDTH, axis=1).repeat(WIDTH, axis=2)
     size_mm = grid.cell_size_mm / WIDTH
     return Window(grid.origin_mm + low * grid.cell_size_mm - 0.5 * (grid.cell_size_mm - size_mm), fine), layer
 
 
 def sizes_mm(case: FlowCase, cell_size_mm: float) -> tuple[float, ...]:
-    """Return the grid spacings of the levels of a case, coarse to fine, where `cell_size_mm` is wanted in the sac.
+    """Return the grid spacings of the levels of a case, coarse to fine, where `cell_size_mm` is wanted.
 
-    With `close_up` one is coarser; those around wires are finer. Where there is no sac a `FlowError` is raised.
+    One is coarser where it is wanted in a part of the vessel; those around wires and in narrow branches are finer.
+    Where there is no such part a `FlowError` is raised.
     """
-    coarser = int(case.numerics.close_up and require_sac(case) is not None)
-    finer = ceil(log2(max(1.0, cell_size_mm / around_wires_mm(case))))
-    return tuple(cell_size_mm / WIDTH**k for k in range(-coarser, finer + 1))
+    if "sac" in case.numerics.refine:
+        require_sac(case)
+    _balls(case, cell_size_mm)
+    finer = max(wire_levels(case, cell_size_mm), further_levels(case, cell_size_mm))
+    return tuple(cell_size_mm / WIDTH**k for k in range(-case.numerics.coarser_levels, finer + 1))
+
+
+def wire_levels(case: FlowCase, cell_size_mm: float) -> int:
+    """Return the number of levels finer than the grid spacing around wires or a neck with a screen."""
+    return ceil(log2(max(1.0, cell_size_mm / around_wires_mm(case))))
 
 
 def around_wires_mm(case: FlowCase) -> float:
@@ -336,18 +377,18 @@ def around_wires_mm(case: FlowCase) -> float:
     return inf
 
 
-def refined(case: FlowCase, coarse: Grid, finest_mm: float) -> tuple[Grid, Grid, Interface]:
-    """Return a grid, the next finer one in it, and the coupling of both.
+def refined(case: FlowCase, coarse: Grid, cell_size_mm: float) -> tuple[Grid, Grid, Interface]:
+    """Return a grid of a case with a grid spacing, the next finer one in it, and the coupling of both.
 
-    With `close_up` the first grid is refined in the sac and in narrow branches; all are around wires. Wires are walls
-    of the finer grid where they are thick enough for it.
+    A grid coarser than the spacing is refined where the settings say; all are around wires and in narrow branches.
+    Wires are walls of the finer grid where they are thick enough for it.
     """
     wide = coarse.domain
-    wanted = np.zeros(len(wide.cells), bool)
-    if case.numerics.close_up and not coarse.crossings:
-        wanted = near_sac(case, wide) | near_narrow(case, wide)
-    if wide.cell_size_mm > max(1.5 * finest_mm, around_wires_mm(case)):
-        wanted |= near_wires(case, wide, finest_mm)
+    wanted = _in(_spheres(case, wide.cell_size_mm, cell_size_mm), wide.centers_mm)
+    if wide.cell_size_mm > cell_size_mm and "sac" in case.numerics.refine:
+        wanted |= near_sac(case, wide)
+    if wide.cell_size_mm > around_wires_mm(case):
+        wanted |= near_wires(case, wide, cell_size_mm / WIDTH ** wire_levels(case, cell_size_mm))
     part, layer = window(wide, wanted, None if coarse.side is None else coarse.side % 2 == 0)
     size_mm = wide.cell_size_mm / WIDTH
     domain = domains.build(case.vessel, size_mm, part, domains.wires_of(case, size_mm))

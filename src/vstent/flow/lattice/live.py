@@ -210,7 +210,7 @@ class LiveFlow:
     def __init__(
         self, case: FlowCase, told: Callable[[float], None] | None = None, stored: BareFlow | None = None
     ) -> None:
-        numerics = replace(case.numerics, close_up=True, wires="screen", device_gpu=False, tolerance=TOLERANCE)
+        numerics = replace(case.numerics, refine=("sac",), wires="screen", device_gpu=False, tolerance=TOLERANCE)
         self.case = replace(case, waveform=None, numerics=replace(numerics, cells_across_neck=0.0))
         self.cell_size_mm = preview_spacing_mm(self.case)
         self.outer = self._around(told) if stored is None else stored.outer
@@ -223,7 +223,7 @@ class LiveFlow:
     def _around(self, told: Callable[[float], None] | None) -> FlowField:
         """Return the flow of the whole vessel on the coarse grid once its blood has been exchanged."""
         # Oscillations at the neck would need most of the steps, and the fine grid computes the neck.
-        numerics = replace(self.case.numerics, close_up=False)
+        numerics = replace(self.case.numerics, refine=())
         case = replace(self.case, target=Target(require_sac(self.case), None), numerics=numerics)
         engine = LatticeBoltzmann(WIDTH * self.cell_size_mm)
         state, left = engine.init(case, None), None

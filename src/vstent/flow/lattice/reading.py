@@ -13,7 +13,7 @@ from vstent.flow.case import FlowField, Level, Phase
 from vstent.flow.ends import outflows
 from vstent.flow.engines import Outcome
 from vstent.flow.indices import neck_diameter_mm
-from vstent.flow.lattice.levels import WIDTH
+from vstent.flow.lattice.levels import WIDTH, further_levels
 from vstent.flow.lattice.setup import CELL_REYNOLDS
 from vstent.flow.lattice.state import NECK_INFLOW, Snapshot, State, trusted
 from vstent.flow.lattice.stepping import read_here, snapshot
@@ -108,7 +108,7 @@ def field_of(
     phases: tuple[Phase, ...] = (),
 ) -> FlowField:
     """Return the flow field of a run from the flow on the levels kept, and on finer ones for the values at the wall."""
-    vessel, flow, finest = state.case.vessel, joined(state, flows), state.levels[-1]
+    vessel, flow, finest = state.case.vessel, joined(state, flows), state.at_wires
     section_Pa = domains.section_pressure_Pa(vessel, state.domain, flow.pressure_Pa)
     inlet_Pa, outlet_Pa = vessel.of_inlets_and_outlets(section_Pa)
     levels = tuple(
@@ -152,7 +152,7 @@ def neck_mL_s(state: State, check: int = -1) -> float | None:
 
 def _remarks(state: State, levels: Sequence[Level], phases: Sequence[Phase]) -> str:
     """Return sentences on wires, levels, GPU, and on where the grid is too coarse for the vessel or for the flow."""
-    case, finest, remarks = state.case, state.levels[-1].domain, ""
+    case, finest, remarks = state.case, state.at_wires.domain, ""
     wires = domains.wires_of(case, finest.cell_size_mm)
     if wires is not None:
         remarks += (
@@ -172,7 +172,9 @@ def _remarks(state: State, levels: Sequence[Level], phases: Sequence[Phase]) -> 
         remarks += f" The grid spacing is {sizes}, from the whole vessel to the finest level."
     if state.device is not None:
         remarks += f" Time steps were launched on the GPU {state.device.how}."
-    remarks += domains.too_narrow(case, state.main.domain.cell_size_mm) + domains.unreached(case.vessel, state.domain)
+    size_mm = state.kept[-1].domain.cell_size_mm
+    size_mm /= WIDTH ** further_levels(case, size_mm)
+    remarks += domains.too_narrow(case, size_mm) + domains.unreached(case.vessel, state.domain)
     for number, (level, own) in enumerate(zip(state.kept, levels, strict=True)):
         moments_m_s = [phase.velocity_m_s[number] for phase in phases] or [own.velocity_m_s]
         speed_m_s = np.max([np.linalg.norm(one, axis=1) for one in moments_m_s], axis=0)

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from vstent.flow import domain as domains, sampling
 from vstent.flow.case import FlowCase
 from vstent.flow.lattice.kernels import d3q19
-from vstent.flow.lattice.levels import Interface
+from vstent.flow.lattice.levels import Interface, wire_levels
 from vstent.flow.lattice.scales import Scales
 from vstent.flow.lattice.screen import ScreenEntries
 from vstent.flow.lattice.setup import Addressing, Links, Refill
@@ -164,13 +164,19 @@ class State:
 
     @property
     def kept(self) -> "tuple[State, ...]":
-        """Return the levels whose flow is a result: all but the finer ones around wires."""
-        return self.levels[: 1 + self.case.numerics.close_up]
+        """Return the levels whose flow is a result: all but those finer than the grid spacing."""
+        return self.levels[: 1 + self.case.numerics.coarser_levels]
 
     @property
     def main(self) -> "State":
-        """Return the level with the grid spacing of the case, which contains the sac."""
-        return self.kept[-1]
+        """Return the finest level kept that contains the sac."""
+        return self.kept[-1] if "sac" in self.case.numerics.refine else self
+
+    @property
+    def at_wires(self) -> "State":
+        """Return the finest level around wires or a neck; finer ones lie in narrow branches."""
+        of_wires = wire_levels(self.case, self.kept[-1].domain.cell_size_mm)
+        return self.levels[self.case.numerics.coarser_levels + of_wires]
 
     @cached_property
     def sac_cells(self) -> Ints:

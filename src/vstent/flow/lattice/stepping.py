@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from time import perf_counter
 from typing import Any, Final
@@ -29,6 +30,7 @@ from vstent.flow.lattice.levels import (
     beside_walls,
     refined,
     sizes_mm,
+    wire_levels,
 )
 from vstent.flow.lattice.scales import Scales, odd_rate
 from vstent.flow.lattice.screen import build_screen
@@ -73,7 +75,7 @@ def build(
     else:
         begun = start
     grids = _grids(case, cell_size_mm)
-    finest, last = grids[-1]
+    finest, last = grids[case.numerics.coarser_levels + wire_levels(case, cell_size_mm)]
     if last is not None and domains.wires_of(case, finest.domain.cell_size_mm):
         case = beside_walls(case, finest.domain.centers_mm[last.is_trusted])
     levels = [_level(case, grid, check_s, WIDTH**depth * pace, begun, kept) for depth, (grid, _) in enumerate(grids)]
@@ -148,7 +150,7 @@ def _grids(case: FlowCase, cell_size_mm: float) -> list[tuple[Grid, Interface | 
     sizes = sizes_mm(case, cell_size_mm)
     coarsest_mm, finest_mm = sizes[0], sizes[-1]
     are_walls = domains.wires_of(case, finest_mm) is not None
-    part = (case.sac, case.numerics.close_up) if len(sizes) > 1 else None
+    part = (case.sac, case.numerics.refine, case.is_split_given) if len(sizes) > 1 else None
     key = sizes, part, case.solids if are_walls else ()
     if key not in built:
         for of_walls in [other for other in built if other[2]]:  # of another device, or of another tile of it
@@ -156,9 +158,10 @@ def _grids(case: FlowCase, cell_size_mm: float) -> list[tuple[Grid, Interface | 
         domain = domains.build(case.vessel, coarsest_mm, wires=domains.wires_of(case, coarsest_mm))
         limit = thickest(case, domain)
         grids: list[tuple[Grid, Interface | None]] = [(Grid(domain, limit, address(domain, limit)), None)]
-        while len(grids) < len(sizes):
-            coarse, fine, between = refined(case, grids[-1][0], finest_mm)
-            grids[-1:] = (coarse, grids[-1][1]), (fine, between)
+        with suppress(domains.CoarseGridError):  # the rest of a branch is too short
+            while len(grids) < len(sizes):
+                coarse, fine, between = refined(case, grids[-1][0], cell_size_mm)
+                grids[-1:] = (coarse, grids[-1][1]), (fine, between)
         built[key] = grids
     return [(grid, between and between.anew()) for grid, between in built[key]]
 
@@ -493,7 +496,7 @@ def monitored(state: State, now: Sequence[Snapshot]) -> Floats:
     """
     first_inflow = state.links.patch[np.argmax(state.links.is_inflow)]
     inlet = state.domain.link_cell[state.domain.link_patch == first_inflow]
-    in_sac = speeds(now[len(state.kept) - 1].velocity_m_s[state.main.sac_cells])
+    in_sac = speeds(now[state.levels.index(state.main)].velocity_m_s[state.main.sac_cells])
     values = [in_sac.mean(), now[0].pressure_Pa[inlet].mean(), now[0].speed_m_s.mean()]
     if state.neck:
         parts = zip(state.levels, now, state.neck, strict=True)
