@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vstent.flow.lattice.kernels import d3q19, gpu as kernels
+from vstent.flow.lattice.levels import Stencil
 from vstent.flow.lattice.setup import Addressing, Links
 from vstent.flow.lattice.state import State
 from vstent.kernels.arrays import Floats, Ints
@@ -80,7 +81,7 @@ def _layout(state: State) -> Layout:
     slot = np.zeros(len(order), np.int32)
     slot[order] = np.arange(len(order), dtype=np.int32)
     # A near link needs a population that arrives at its cell: its wall is nearer than half-way.
-    is_near = (links.weight[:, 1] != 0) & (links.path[0, :, 1] == links.address[:, 1])
+    is_near = (links.weight[:, 1] != 0)[: len(slot)] & (links.path[0, : len(slot), 1] == links.address[:, 1])
     special = np.unique(np.concatenate([cell, refilled_cell]))
     ends, is_end = int(links.start[-1]), np.arange(len(slot)) < links.start[-1]
     of_cell, of_link = np.zeros((4, len(special)), np.int32), np.searchsorted(special, cell)
@@ -189,6 +190,23 @@ def tables_of(state: State) -> Tables:
     }
     integers[list(head)] = list(head.values())
     return Tables(integers, singles, doubles, places, refilled)
+
+
+def stencil_of(along: Stencil) -> tuple[Ints, NDArray[np.float32], Ints, NDArray[np.float32]]:
+    """Return the arrays of a stencil for `kernels.gpu.carry`, of k entries at most for each of n target cells.
+
+    Neighbouring threads read neighbouring values. The arrays are (3, n) storage places, groups and numbers of entries,
+    (4, n) limits and shares, (k, n) storage places of the cells read, and (2, k, n) their weights.
+    """
+    count = np.diff(along.start)
+    target = np.repeat(np.arange(len(count)), count)
+    number = np.arange(len(target)) - along.start[target]
+    entry = np.zeros((count.max(initial=0), len(count)), np.int32)
+    entry[number, target] = along.place[along.cell]
+    weight = np.zeros((2, *entry.shape), np.float32)
+    weight[:, number, target] = along.weight.T
+    integers = np.stack([along.target, along.group, count]).astype(np.int32)
+    return integers, np.concatenate([along.limit[None], along.share.T]), entry, weight
 
 
 def joined(tables: Mapping[Name, NDArray[Any]], dtype: type) -> tuple[NDArray[Any], dict[Name, slice]]:

@@ -185,8 +185,7 @@ def _remarks(state: State, levels: Sequence[Level], phases: Sequence[Phase]) -> 
 
 def force_N(state: State) -> Floats:
     """Return the force (3,) of the blood on the wires that are walls."""
-    if state.device is not None:
-        state.device.fetch(state)
+    state.fetch()
     links = state.links
     momentum = exchanged(state.populations, links.address[links.of_wires], links.wire_direction)
     return momentum.sum(axis=0) * _newton(state)
@@ -194,6 +193,7 @@ def force_N(state: State) -> Floats:
 
 def forces_N(state: State) -> tuple[Floats, Floats]:
     """Return cells (m, 3), mm, of a level, and the force (m, 3) of their blood on wires beside them and on a screen."""
+    state.fetch()
     links, a, screen = state.links, state.addressing, state.screen
     address = links.address[links.of_wires]
     on_walls = exchanged(state.populations, address, links.wire_direction)
