@@ -1,7 +1,7 @@
 """The screen beside resolved struts, over necks and branches: write `struts.json`, print it as a table.
 
 Usage: python benchmarks/struts.py [--vessel demo|arc|tee] [--cell MM] [--foam-cell MM] [--across CELLS] [-j N]
-                                   [--cases FOLDER] [--wires WORD] [DEVICE ...]
+                                   [--cases FOLDER] [--wires WORD] [--picture FILE] [DEVICE ...]
 
 The demo's artery, an arc of one with a sac at its side, cut to 9 mm on either side of the sac, or a straight one with a
 small sac, cut to 3 mm, is computed twice
@@ -12,8 +12,9 @@ what lies on the artery's wall, is kept besides. The two engines differ in the b
 leaves of each engine's own bare value stands beside. `alignment` is the correlation of the two velocity fields in the
 sac, 1 where they are alike but for their size. A row is kept for every device in every vessel; other rows stay as they
 are. With --wires, only the embedded engine computes, takes the wires in that way (``vstent run --wires``), at a spacing
-of its own where none is given, and prints what it finds. With --cases, OpenFOAM's cases stay in that folder, by vessel
-and device, and one that is there already resumes.
+of its own where none is given, and prints what it finds; --across is then the least number of cells across a wire that
+is a wall. --picture draws it beside the screen, in the plane of the artery through the middle of the sac. With --cases,
+OpenFOAM's cases stay in that folder, by vessel and device, and one that is there already resumes.
 """
 
 import argparse
@@ -26,6 +27,7 @@ from tempfile import TemporaryDirectory
 from typing import get_args
 
 import numpy as np
+from matplotlib.figure import Figure
 
 import vstent
 from vstent import phantoms
@@ -33,7 +35,7 @@ from vstent.anatomy.restore.restore import restore
 from vstent.anatomy.trace import trace
 from vstent.anatomy.trim import trim
 from vstent.deployment.struts import is_over_restored
-from vstent.flow import sampling
+from vstent.flow import domain as domains, sampling
 from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.engines import run
 from vstent.flow.indices import indices
@@ -115,25 +117,63 @@ def alignment(screened: FlowField, resolved: FlowField, sac: Surface) -> float:
     return round(float((one * other).sum() / np.sqrt((one**2).sum() * (other**2).sum())), 4)
 
 
+def picture(screened: FlowField, other: FlowField, case: FlowCase, path: Path) -> None:
+    """Draw the speeds with a screen and with other wires in the plane of artery and sac, and their difference."""
+    assert case.sac is not None
+    assert case.ostium is not None
+    neck_mm, middle_mm = case.ostium.vertices_mm.mean(axis=0), case.sac.vertices_mm.mean(axis=0)
+    up = (middle_mm - neck_mm) / np.linalg.norm(middle_mm - neck_mm)
+    line = case.vessel.centerlines[0].points_mm
+    nearest = int(np.linalg.norm(line - neck_mm, axis=1).argmin())
+    along = line[nearest + 5] - line[nearest - 5]
+    along -= (along @ up) * up
+    along /= np.linalg.norm(along)
+    size_mm = 0.6 * np.ptp(case.sac.vertices_mm @ along), np.ptp(case.sac.vertices_mm @ up)
+    x, y = np.meshgrid(np.linspace(-size_mm[0], size_mm[0], 300), np.linspace(-0.3 * size_mm[1], 1.1 * size_mm[1], 300))
+    points_mm = neck_mm + x.reshape(-1, 1) * along + y.reshape(-1, 1) * up
+    is_blood, in_sac = (one.signed_distance(points_mm) < 0 for one in (case.vessel.closed, case.sac))
+    speeds = [np.linalg.norm(sampling.values_at(one, points_mm)[0], axis=1) for one in (screened, other)]
+    parts = (is_blood, speeds[1]), (is_blood, speeds[0]), (in_sac, speeds[0] - speeds[1])
+    most = 1e3 * np.quantile(speeds[1][in_sac], 0.98), 1e3 * np.quantile(abs(speeds[0] - speeds[1])[in_sac], 0.98)
+    figure = Figure(figsize=(11, 4), layout="constrained")
+    titles = (f"wires {case.numerics.wires}", "screen", f"screen minus {case.numerics.wires}")
+    ways = ("cividis", 0.0, most[0]), ("cividis", 0.0, most[0]), ("PuOr", -most[1], most[1])
+    for axes, (is_shown, speed), title, (colors, low, high) in zip(
+        figure.subplots(1, 3), parts, titles, ways, strict=True
+    ):
+        values = np.where(is_shown, 1e3 * speed, np.nan).reshape(x.shape)
+        mesh = axes.pcolormesh(x, y, values, cmap=colors, vmin=low, vmax=high, rasterized=True)
+        axes.set(title=title, aspect="equal", xlabel="along the artery, mm", ylabel="from the neck, mm")
+        figure.colorbar(mesh, ax=axes, label="mm/s", shrink=0.8)
+    figure.savefig(path, dpi=90)
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("devices", nargs="*", default=["enterprise", "silk"])
     parser.add_argument("--vessel", choices=VESSELS, default="demo")
     parser.add_argument("--cell", type=float)
     parser.add_argument("--foam-cell", type=float, default=0.2)
-    parser.add_argument("--across", type=float, default=setup.ACROSS)
+    parser.add_argument("--across", type=float)
     parser.add_argument("-j", dest="processes", type=int, default=1)
     parser.add_argument("--cases", type=Path)
     parser.add_argument("--wires", choices=get_args(Wires))
+    parser.add_argument("--picture", type=Path)
     given = parser.parse_args()
     make, kept_mm = VESSELS[given.vessel]
     if given.wires:
+        domains.LEAST_ACROSS = given.across or domains.LEAST_ACROSS
         for _, case in cases(given.devices, make(), kept_mm).values():
-            if case.solids:
-                computed(case, None, cell_size_mm=given.cell, wires=given.wires)
+            if not case.solids:
+                continue
+            found = computed(case, None, cell_size_mm=given.cell, wires=given.wires)[0]
+            if given.picture:
+                beside = computed(case, None, cell_size_mm=given.cell, wires="screen")[0]
+                asked = replace(case, numerics=replace(case.numerics, wires=given.wires))
+                picture(beside, found, asked, given.picture)
         raise SystemExit
     given.cell = given.cell or 0.125
-    setup.ACROSS = given.across
+    setup.ACROSS = given.across = given.across or setup.ACROSS
     rows = json.loads(TABLE.read_text()) if TABLE.exists() else {}
     foam = {"engine": OPENFOAM, "cell_size_mm": given.foam_cell, "processes": given.processes}
     bare: tuple[FlowField, dict[str, float]] | None = None

@@ -10,7 +10,7 @@ from levels import with_values
 from shapes import sphere
 
 from vstent.flow.case import FlowField, Level, Phase
-from vstent.flow.indices import NEAR_MM, compare, indices, ratios
+from vstent.flow.indices import NEAR_MM, compare, indices, on_sac, ratios
 from vstent.flow.settings import Blood
 from vstent.geometry.surface import Surface
 from vstent.kernels.arrays import Floats
@@ -106,6 +106,18 @@ def test_the_parents_stress_is_that_within_ten_millimetres_of_the_necks_edge() -
     area_mm2 = 64 + 32 * NEAR_MM + np.pi * NEAR_MM**2
     integral = 16 * NEAR_MM**2 + 2 * np.pi * NEAR_MM**3 / 3
     assert found["parent_wss_Pa"] == pytest.approx(1.0 + integral / area_mm2, rel=0.02)
+
+
+def test_the_artery_on_the_rim_of_the_neck_is_not_of_the_sac() -> None:
+    """A vertex on the curve where a sac leaves the artery lies on both; its stress is the artery's on any grid."""
+    whole = sac()
+    neck = plate(NECK_HALF_MM, 0.2)
+    rim = np.array([[NECK_HALF_MM + away_mm, 0.0, 0.0] for away_mm in (0.0, 0.04, 0.06)])
+    beside = Surface(
+        np.concatenate([whole.vertices_mm, rim]), np.r_[whole.faces, [len(whole.vertices_mm) + np.arange(3)]]
+    )
+    assert on_sac(beside, beside, neck)[-3:].tolist() == [False, False, True]
+    assert on_sac(beside, whole, neck)[: len(whole.vertices_mm)].all()
 
 
 def test_quotients_of_a_pulse_are_of_its_means() -> None:

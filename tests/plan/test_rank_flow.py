@@ -128,6 +128,25 @@ def test_a_flow_starts_from_that_of_the_most_similar_coverage(monkeypatch: pytes
     assert len(kept) == begun.count(None)  # a study would compute these in the same way
 
 
+@pytest.mark.parametrize(("asked", "taken"), [("auto", "screen"), ("resolved", "screen"), ("calibrated", "calibrated")])
+def test_wires_are_a_screen_which_is_not_kept_as_a_flow_with_walls(monkeypatch, asked, taken) -> None:
+    wires, kept = [], []
+
+    def noting(case, **_):
+        wires.append(case.numerics.wires)
+        return SimpleNamespace(unsettled_fraction=0.0)
+
+    monkeypatch.setattr(rank_flow, "simulate_case", noting)
+    settings = replace(SETTINGS, numerics=replace(SETTINGS.numerics, wires=asked))
+    keep = lambda one, _: kept.append(one)  # noqa: E731
+    flows = rank_flow._Flows(anatomy(), settings, has_contrast=False, coming=[0.3], keep=keep)
+    one = chosen_of(ranking(), 1)[0]
+    flows.computed(None)
+    flows.computed(one)
+    assert wires == [taken, taken]
+    assert kept == ([None, one] if asked == taken else [None])
+
+
 def test_on_a_gpu_a_flow_is_measured_while_the_next_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("numba.threading_layer", lambda: "omp")
     monkeypatch.setattr(rank_flow, "grade", lambda *_: SimpleNamespace(level="good"))

@@ -20,7 +20,6 @@ from vstent.flow.case import FlowCase, FlowField
 from vstent.flow.indices import on_sac, vertex_areas_mm2
 from vstent.flow.memory import free_memory_bytes
 from vstent.flow.problem import flow_case
-from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Bools, Floats, Ints
 
@@ -201,7 +200,7 @@ def angiogram(
     measures |= {"mean_sac_age_s": washout.mean_age_s, "sac_age_extrapolated_fraction": washout.tail_fraction}
     if washout.tail_fraction > 0.1:
         said += f" {washout.tail_fraction:.0%} of the mean age is extrapolated from the last seconds of the washout."
-    return Angiogram(curves, measures | _unexchanged(washout, near, in_sac, case.vessel.lumen, case.sac), said)
+    return Angiogram(curves, measures | _unexchanged(washout, near, in_sac, case), said)
 
 
 def _curves(ready: Injection, anatomy: Anatomy, watch: Watch | None, tell: Callable[[float], None]) -> Curves:
@@ -221,9 +220,12 @@ def _curves(ready: Injection, anatomy: Anatomy, watch: Watch | None, tell: Calla
     return Curves(*table[table[:, 0] >= -1e-9].T)
 
 
-def _unexchanged(washout: Washout, near: Network, in_sac: Ints, wall: Surface, sac: Surface) -> dict[str, float]:
+def _unexchanged(washout: Washout, near: Network, in_sac: Ints, case: FlowCase) -> dict[str, float]:
     """Return the volume and wall area of the sac without exchange after 1, 2 and 5 s."""
-    mine = np.flatnonzero(on_sac(wall, sac, 0.2 * near.spacing_mm))
+    assert case.sac is not None
+    assert case.ostium is not None
+    wall, sac = case.vessel.lumen, case.sac
+    mine = np.flatnonzero(on_sac(wall, sac, case.ostium))
     area_mm2 = vertex_areas_mm2(wall)[mine]
     beside = cKDTree(near.points_mm[in_sac]).query(wall.vertices_mm[mine])[1]
     weight = near.volume_mm3[in_sac] / near.volume_mm3[in_sac].sum()

@@ -25,6 +25,11 @@ FAST_M_S = 0.08
 """Speed, m/s, above which blood in a sac counts as part of the inflow jet."""
 NEAR_MM = 10.0
 """Distance from the neck, mm, within which wall belongs to the parent artery (Cebral et al. 2011, AJNR 32, 145)."""
+ON_SAC_MM: Final = 0.02
+"""Distance from the sac's surface within which wall may belong to the sac."""
+RIM_MM: Final = 0.05
+"""Distance from the neck within which wall counts as the artery's. No grid tells both apart there, and behind a dense
+braid the artery's shear stress on such a rim would exceed that of the whole sac."""
 QUANTITIES: Final = (
     "neck_inflow_mL_s",
     "mean_sac_velocity_m_s",
@@ -233,7 +238,7 @@ def _of_sac(field: FlowField, sac: Surface) -> dict[str, float]:
 def _of_sac_wall(field: FlowField, sac: Surface, ostium: Surface) -> dict[str, float]:
     """Return the indices of wall shear stress on the sac and the parent artery."""
     stress_Pa, area_mm2 = field.shear_Pa, vertex_areas_mm2(field.wall)
-    is_sac = on_sac(field.wall, sac, 0.2 * field.finest.cell_size_mm)
+    is_sac = on_sac(field.wall, sac, ostium)
     is_near = ostium.closest(field.wall.vertices_mm)[1] < NEAR_MM
     moments_Pa = [np.linalg.norm(phase.wall_shear_stress_Pa[is_sac], axis=1) for phase in field.phases]
 
@@ -251,9 +256,9 @@ def _of_sac_wall(field: FlowField, sac: Surface, ostium: Surface) -> dict[str, f
     }
 
 
-def on_sac(wall: Surface, sac: Surface, tolerance_mm: float) -> Bools:
-    """Return which vertices (v,) of the wall are within a tolerance of the sac's surface."""
-    return sac.closest(wall.vertices_mm)[1] < tolerance_mm
+def on_sac(wall: Surface, sac: Surface, ostium: Surface) -> Bools:
+    """Return which vertices (v,) of the wall belong to a sac: they lie on its surface, and not on the neck's rim."""
+    return (sac.closest(wall.vertices_mm)[1] < ON_SAC_MM) & (ostium.closest(wall.vertices_mm)[1] > RIM_MM)
 
 
 def vertex_areas_mm2(surface: Surface) -> Floats:

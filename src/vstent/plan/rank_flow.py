@@ -166,7 +166,8 @@ class _Flows:
         field, measured = flow_with(
             self.anatomy, candidate, self.settings, start=self._bare, similar=similar, has_contrast=self.has_contrast
         )
-        if self._keep is not None and field is not None and similar is None:
+        is_as_asked = candidate is None or self.settings == with_screens(self.settings)
+        if self._keep is not None and field is not None and similar is None and is_as_asked:
             self._keep(candidate, field)
         if candidate is None:
             self._bare = field
@@ -187,12 +188,12 @@ def flow_with(
 ) -> tuple[FlowField | None, Callable[[], Mapping[str, Any]]]:
     """Compute the flow with one candidate, and return it with a function that measures what a ranking keeps of it.
 
-    Wires are a screen. The flow starts from that with a `similar` device, or from that without one, `start`. Where the
-    flow with a device cannot be computed, it is None, and the function returns an error message; without a device a
-    FlowError is raised.
+    Wires are as in `with_screens`. The flow starts from that with a `similar` device, or from that without one,
+    `start`. Where the flow with a device cannot be computed, it is None, and the function returns an error message;
+    without a device a FlowError is raised.
     """
-    screened = replace(settings, numerics=replace(settings.numerics, wires="screen"))
-    case = flow_case(anatomy, () if candidate is None else (stent_of(anatomy, candidate),), screened)
+    stents = () if candidate is None else (stent_of(anatomy, candidate),)
+    case = flow_case(anatomy, stents, with_screens(settings))
     try:
         field = simulate_case(case, start=start, similar=similar)
     except FlowError as error:
@@ -200,6 +201,14 @@ def flow_with(
             raise
         return None, partial(dict, {"error": str(error)})
     return field, partial(_measured, anatomy if has_contrast else None, case, field)
+
+
+def with_screens(settings: FlowSettings) -> FlowSettings:
+    """Return settings with wires as a screen, calibrated where that is asked for."""
+    numerics = settings.numerics
+    return replace(
+        settings, numerics=replace(numerics, wires="calibrated" if numerics.wires == "calibrated" else "screen")
+    )
 
 
 def _measured(carrying: Anatomy | None, case: FlowCase, field: FlowField) -> Mapping[str, Any]:

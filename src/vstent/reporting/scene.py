@@ -257,8 +257,6 @@ STEEL_COLOUR = (0.33, 0.38, 0.43)
 INK_COLOUR = (0.10, 0.17, 0.20)
 ASSUMED_COLOUR = (0.45, 0.36, 0.58)
 """Colors of wall, neck, devices, lines, and of centerlines and assumed arteries: red, green and blue, 0 to 1."""
-ON_SAC_CELLS = 0.2
-"""Distance from the sac, in cells, within which a vertex of the wall belongs to it (as in `flow.indices`)."""
 RING_MM = 1.0
 """Distance between the rings that show a continued artery, in mm."""
 
@@ -338,7 +336,7 @@ def flow_layers(name: str, flow: FlowField, anatomy: Anatomy) -> list[MeshLayer 
     ]
     seeds = [inlet_seeds_mm(flow, anatomy.vessel, N_INLET)]
     for aneurysm in anatomy.aneurysms[:1]:
-        is_sac = on_sac(flow.wall, aneurysm.sac, ON_SAC_CELLS * flow.finest.cell_size_mm)
+        is_sac = on_sac(flow.wall, aneurysm.sac, aneurysm.neck)
         used, corners = np.unique(flow.wall.faces[is_sac[flow.wall.faces].all(axis=1)], return_inverse=True)
         sac, origin = thin_surface(Surface(flow.wall.vertices_mm[used], corners.reshape(-1, 3)), 20_000)
         shear_Pa = flow.shear_Pa[used][origin]

@@ -15,7 +15,7 @@ from vstent.flow.simulation import memory_bytes
 from vstent.geometry.vessel import Anatomy
 from vstent.io.files import write_bytes
 from vstent.plan.rank import Candidate
-from vstent.plan.rank_flow import coverage_of, flow_with, is_finished, nearest, stent_of
+from vstent.plan.rank_flow import coverage_of, flow_with, is_finished, nearest, stent_of, with_screens
 from vstent.study.folder import CACHE
 from vstent.study.keys import key_of
 from vstent.study.store import Key, Store
@@ -144,7 +144,8 @@ def parallel_flows(
     """
     needed = 0.0
     if chosen and anatomy.aneurysms:
-        needed = memory_bytes(flow_case(anatomy, (stent_of(anatomy, chosen[0]),), settings)) or 0.0
+        stents = (stent_of(anatomy, chosen[0]),)
+        needed = memory_bytes(flow_case(anatomy, stents, with_screens(settings))) or 0.0
     if settings.numerics.device_gpu or not needed:
         return 1, needed / BYTES_PER_MB
     fitting = min(jobs // settings.numerics.processes, free_memory_bytes() // needed)
