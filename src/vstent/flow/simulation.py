@@ -4,8 +4,10 @@ from collections.abc import Callable, Hashable, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from math import inf
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from time import perf_counter
 from typing import Any, Protocol
 from weakref import WeakKeyDictionary
 
@@ -29,6 +31,8 @@ from vstent.units import duration
 
 SCREEN_SHARE = 0.02
 """Assumed share of the run time of the flow with a screen, from which one with resolved wires begins."""
+ROUND_SHARE = 0.6
+"""Assumed share of the run time of the flow in a round of a calibration; the rest is that of the tile."""
 COARSE_SHARE = 0.12
 """Assumed share of the run time of each coarse run, for the progress."""
 
@@ -317,13 +321,14 @@ class _Runs:
         rounds: list[tuple[float, float, float]] = []
         for number in range(runs - 1):
             steady = replace(calibration.scaled(case, factor), waveform=None)
-            progress = self._part(number / runs, (number + 1) / runs)
+            progress = self._part(number / runs, (number + ROUND_SHARE) / runs)
             now = replace(self, engine=_engine_of(steady), prefix=f"round {number} ", progress=progress)
             similar = replace(now, similar=similar).answer(steady, start)
             if not rounds:
                 center_mm = calibration.strongest_mm(steady, similar)
                 walls = calibration.tile(steady, center_mm)
-            rounds.append((factor, *calibration.read_off(steady, walls, similar, size_mm, center_mm)))
+            told = partial(_of_tile, self._part((number + ROUND_SHARE) / runs, (number + 1) / runs), perf_counter())
+            rounds.append((factor, *calibration.read_off(steady, walls, similar, size_mm, center_mm, told)))
             factor = calibration.next_factor(rounds)
         if case.waveform is not None:  # a pulse begins with a phase of the one before, and converges in fewer cycles
             similar = self.similar
@@ -377,6 +382,12 @@ class _Runs:
             whole(Progress(fraction, now.residual, seconds_left))
 
         return report
+
+
+def _of_tile(progress: OnProgress | None, began: float, fraction: float) -> None:
+    """Report the progress of a tile that began at a time."""
+    if progress is not None:
+        progress(Progress(fraction, inf, (perf_counter() - began) * (1 / fraction - 1)))
 
 
 def _guessed(engine: AbstractEngine[Any], case: FlowCase, guess: Guess) -> FlowField | None:

@@ -58,10 +58,16 @@ def test_a_screen_is_calibrated_to_what_stands_for_its_wires(
     wanted = found(simulate_case(known), known)
     begun = calibration.scaled(known, times)
     assert (np.abs(found(simulate_case(begun), begun) / wanted - 1) > 0.1)[:2].all()
-    field = simulate_case(with_numerics(begun, wires="calibrated"))
+    told: list[float] = []
+    field = simulate_case(with_numerics(begun, wires="calibrated"), progress=lambda now: told.append(now.fraction))
+    assert told == sorted(told)
+    share = simulation.ROUND_SHARE
+    of_tiles = [sum((n + share) / 3 < one <= (n + 1) / 3 for one in told) for n in range(calibration.ROUNDS)]
+    assert of_tiles == calibration.ROUNDS * [2 * calibration.READINGS]
     factor = float(field.advice.split("it resists ")[1].split(" times")[0])
     assert factor == pytest.approx(1 / times, rel=0.02)
-    np.testing.assert_allclose(found(field, known), wanted, rtol=0.03)
+    # The time step is another one, to which the shear stress of 13 cells across a neck is sensitive.
+    assert (np.abs(found(field, known) / wanted - 1) < (0.03, 0.03, 0.15)).all()
 
 
 def test_a_tile_has_the_walls_near_a_point_and_the_screen_elsewhere(braided: FlowCase) -> None:

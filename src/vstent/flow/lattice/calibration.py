@@ -9,7 +9,7 @@ The resistance along the device keeps its ratio to that across it. The force alo
 the blood nearly stands still in it, so that a sixth less resistance changes the force by 1 %.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import log
 from typing import Final
@@ -75,14 +75,20 @@ def strongest_mm(case: FlowCase, flow: FlowField) -> Floats:
 
 
 def read_off(
-    case: FlowCase, walls: FlowCase, flow: FlowField, cell_size_mm: float, center_mm: Floats
+    case: FlowCase,
+    walls: FlowCase,
+    flow: FlowField,
+    cell_size_mm: float,
+    center_mm: Floats,
+    told: Callable[[float], None] = lambda _: None,
 ) -> tuple[float, float]:
     """Return what the screen of a steady case and the walls of a tile resist to a flow, up to a common constant.
 
-    Both are 1 where force and velocity are no measure of a resistance (see `LIKE_FLOW`).
+    Both are 1 where force and velocity are no measure of a resistance (see `LIKE_FLOW`). `told` gets the part of the
+    walls that is done.
     """
-    of_screen, _ = _resistance(case, flow, cell_size_mm, center_mm)
-    of_walls, likeness = _resistance(replace(walls, media=case.media), flow, cell_size_mm, center_mm)
+    of_screen, _ = _resistance(case, flow, cell_size_mm, center_mm, lambda _: None)
+    of_walls, likeness = _resistance(replace(walls, media=case.media), flow, cell_size_mm, center_mm, told)
     return (of_screen, of_walls) if likeness > LIKE_FLOW and min(of_screen, of_walls) > 0 else (1.0, 1.0)
 
 
@@ -125,7 +131,9 @@ def _samples(case: FlowCase) -> tuple[Floats, Floats, Floats]:
     return found[:, :3], found[:, 3:6], found[:, 6]
 
 
-def _resistance(case: FlowCase, flow: FlowField, cell_size_mm: float, center_mm: Floats) -> tuple[float, float]:
+def _resistance(
+    case: FlowCase, flow: FlowField, cell_size_mm: float, center_mm: Floats, told: Callable[[float], None]
+) -> tuple[float, float]:
     """Return the resistance to flow through the middle of a tile, up to a constant, and the likeness of force and flow.
 
     It is the least-squares ratio of force and velocity, both along the normal and averaged over `REACH_MM`. The
@@ -139,6 +147,7 @@ def _resistance(case: FlowCase, flow: FlowField, cell_size_mm: float, center_mm:
     along = np.zeros((2, len(nodes_mm)))
     for reading in range(2 * READINGS):
         stepping.advance(state, steps)
+        told((reading + 1) / (2 * READINGS))
         if reading >= READINGS:
             velocity_m_s = stepping.snapshots(state)[0].velocity_m_s.astype(np.float64)
             of_cells = (state.domain.centers_mm, velocity_m_s), forces_N(state.levels[-1])
