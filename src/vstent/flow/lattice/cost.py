@@ -116,6 +116,13 @@ def refuse_too_large(case: FlowCase, free_bytes: float | None = None, gpu_bytes:
         _refuse(case, lambda cell_mm: GPU_BYTES_PER_CELL * _size(case, cell_mm)[0], gpu_bytes, "the GPU's memory")
 
 
+def fits(case: FlowCase) -> bool:
+    """Return whether a flow fits in the free memory, and in the GPU's memory if it runs there."""
+    cells, needed_bytes = _size(case, default_cell_size_mm(case))
+    is_here = not case.numerics.device_gpu
+    return needed_bytes < free_memory_bytes() and (is_here or GPU_BYTES_PER_CELL * cells < free_gpu_bytes())
+
+
 def _refuse(case: FlowCase, needed_bytes: Callable[[float], float], free_bytes: float, of: str) -> None:
     """Raise a `FlowError` when the case needs more bytes than are free in the memory named `of`."""
     cell_size_mm = default_cell_size_mm(case)

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vstent.flow.lattice.kernels import d3q19, gpu as kernels
-from vstent.flow.lattice.levels import Stencil
 from vstent.flow.lattice.setup import Addressing, Links
 from vstent.flow.lattice.state import State
 from vstent.kernels.arrays import Floats, Ints
@@ -190,23 +189,6 @@ def tables_of(state: State) -> Tables:
     }
     integers[list(head)] = list(head.values())
     return Tables(integers, singles, doubles, places, refilled)
-
-
-def stencil_of(along: Stencil) -> tuple[Ints, NDArray[np.float32], Ints, NDArray[np.float32]]:
-    """Return the arrays of a stencil for `kernels.gpu.carry`, of k entries at most for each of n target cells.
-
-    Neighbouring threads read neighbouring values. The arrays are (3, n) storage places, groups and numbers of entries,
-    (4, n) limits and shares, (k, n) storage places of the cells read, and (2, k, n) their weights.
-    """
-    count = np.diff(along.start)
-    target = np.repeat(np.arange(len(count)), count)
-    number = np.arange(len(target)) - along.start[target]
-    entry = np.zeros((count.max(initial=0), len(count)), np.int32)
-    entry[number, target] = along.place[along.cell]
-    weight = np.zeros((2, *entry.shape), np.float32)
-    weight[:, number, target] = along.weight.T
-    integers = np.stack([along.target, along.group, count]).astype(np.int32)
-    return integers, np.concatenate([along.limit[None], along.share.T]), entry, weight
 
 
 def joined(tables: Mapping[Name, NDArray[Any]], dtype: type) -> tuple[NDArray[Any], dict[Name, slice]]:

@@ -11,16 +11,7 @@ import numpy as np
 from numba import cuda
 from numpy.typing import NDArray
 
-from vstent.flow.lattice.gpu_tables import (
-    PAIRS,
-    START,
-    correction_of,
-    joined,
-    layout_of,
-    rates_of,
-    stencil_of,
-    tables_of,
-)
+from vstent.flow.lattice.gpu_tables import PAIRS, START, correction_of, joined, layout_of, rates_of, tables_of
 from vstent.flow.lattice.kernels import d3q19, gpu as kernels
 from vstent.flow.lattice.kernels.gpu import THREADS
 from vstent.flow.lattice.levels import CARRIED_CELLS, OF_SHEAR, WIDTH, Interface, Stencil
@@ -160,14 +151,13 @@ class Device:
 
     def _recorded(self) -> dict[tuple[Pairs, int], Any]:
         """Return functions that replay each sequence of pairs; empty where they cannot be recorded."""
+        level: Device | None
         try:
             return {sequence: recorded(partial(self.make, *sequence), self.stream) for sequence in SEQUENCES}
         except NotRecordedError as reason:
-            self._why, level, stream = f", because {reason}", self, cuda.stream()
-            level.stream = stream
-            while level._finer is not None:
-                level = level._finer
-                level.stream = stream
+            self._why, stream, level = f", because {reason}", cuda.stream(), self
+            while level is not None:
+                level.stream, level = stream, level._finer
             return {}
 
     def make(self, pairs: Pairs, number: int) -> None:
@@ -268,18 +258,33 @@ class Border:
         jumping = *coarse.grid[:2], *fine.grid[:2], put(place[order]), put(finer[order].T), OF_SHEAR, found
         answering = put(first), coarse.passed, fine.passed, found, self.held, CARRIED_CELLS, 1 / WIDTH**3
         self.take = Launch(kernels.take, len(between.beside), (coarse.grid[0], *beside, self.held))
+        carried = (fine, coarse, between.up, 2, WIDTH), (coarse, fine, between.down, 1, 1 / WIDTH)
+        carrying = (
+            (*source.grid, *target.grid, *stencil_of(along), self.held[row], np.float32(ratio))
+            for source, target, along, row, ratio in carried
+        )
         self.couple = (
             Launch(kernels.jumps, len(place), jumping),
             Launch(kernels.answer, len(between.lack) * THREADS, answering),
-            self._carry(fine, coarse, between.up, 2, WIDTH),
-            self._carry(coarse, fine, between.down, 1, 1 / WIDTH),
+            Launch(kernels.carry, len(between.up.target), next(carrying)),
+            Launch(kernels.carry, len(between.down.target), next(carrying)),
         )
 
-    def _carry(self, source: Device, target: Device, along: Stencil, row: int, ratio: float) -> Launch:
-        """Return the launch that sets the cells of a stencil."""
-        stencil = (put(array) for array in stencil_of(along))
-        arguments = *source.grid, *target.grid, *stencil, self.held, row, np.float32(ratio)
-        return Launch(kernels.carry, len(along.target), arguments)
+
+def stencil_of(along: Stencil) -> tuple[Any, Any]:
+    """Return a stencil of n cells with k entries at most on the GPU; neighbouring threads read neighbouring values.
+
+    It is (3 + k, n) storage place, group and number of entries, and storage places of the cells read, and (4 + 2 k, n)
+    limit and shares, and weights.
+    """
+    count = np.diff(along.start)
+    target = np.repeat(np.arange(len(count)), count)
+    entry, most = np.arange(len(target)) - along.start[target], int(count.max(initial=0))
+    cells, parts = np.zeros((3 + most, len(count)), np.int32), np.zeros((4 + 2 * most, len(count)), np.float32)
+    cells[:3], parts[0], parts[1:4] = (along.target, along.group, count), along.limit, along.share.T
+    cells[3 + entry, target] = along.place[along.cell]
+    parts[4 + 2 * entry, target], parts[5 + 2 * entry, target] = along.weight.T
+    return put(cells), put(parts)
 
 
 def seconds_of_update(place: Ints, length: Ints, stride: int, relaxation: Sequence[Any]) -> float:

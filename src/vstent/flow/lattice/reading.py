@@ -165,7 +165,7 @@ def _remarks(state: State, levels: Sequence[Level], phases: Sequence[Phase]) -> 
             remarks += (
                 f" Under-resolved neck: it has {across:.0f} cells across. With fewer than {FEWEST_ACROSS_NECK} behind "
                 "a dense braid, neck inflow and sac velocity are up to a third too high: use a grid spacing of "
-                f"{across / FEWEST_ACROSS_NECK * finest.cell_size_mm:.2g} mm or, on the processor, leave it open."
+                f"{across / FEWEST_ACROSS_NECK * finest.cell_size_mm:.2g} mm, or leave it open."
             )
     if len(state.levels) > 1:
         sizes = ", ".join(f"{one.domain.cell_size_mm:.3g} mm ({len(one.domain.cells):,} cells)" for one in state.levels)

@@ -197,7 +197,7 @@ def twin(state: State) -> State:
 def step(state: State) -> None:
     """Make time steps for a few seconds, at most up to the next check, and record the flow at a check.
 
-    A GPU goes on with the next time steps while the host evaluates the check.
+    A GPU goes on with the next time steps while the host evaluates the check, unless a result may need its populations.
     """
     began, state.begun_s = perf_counter() if state.begun_s is None else state.begun_s, None
     advance(state, _slice_steps(state))
@@ -212,7 +212,7 @@ def step(state: State) -> None:
             if state.case.resistances and len(state.history) % len(state.pace) == 0:
                 _follow(state)
             _keep_pace(state)
-            if state.device is not None:
+            if state.device is not None and state.levels == state.kept and not len(state.levels[-1].links.of_wires):
                 with told():
                     if state.device.begin(*_pairs(state, _slice_steps(state))):
                         state.begun_s = perf_counter()

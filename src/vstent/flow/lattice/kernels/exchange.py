@@ -140,15 +140,6 @@ def density_of(held: Any, part: Any) -> tuple[Any, Any]:
     return density + part * (flux[0] + flux[1] + flux[2] - squared - density), lanes.root(squared)
 
 
-@njit(cache=True, error_model="numpy")
-def _density(f: Any, stride: int, at: int, part: Any) -> tuple[Any, Any]:
-    """Return `density_of` the cell with storage place `at`."""
-    held = np.zeros(19, np.float32)
-    for q in range(19):
-        held[q] = f[q * stride + at]
-    return density_of(held, part)
-
-
 @njit(cache=True)
 def jumps(f: Any, stride: int, g: Any, new_stride: int, overlap: Any, part: Any, groups: int) -> Any:
     """Return the sums (g, 2) over groups: density of a grid less that of the finer one in the same cells, and speed.
@@ -162,9 +153,9 @@ def jumps(f: Any, stride: int, g: Any, new_stride: int, overlap: Any, part: Any,
     place, finer, group = overlap
     result = np.zeros((groups, 2))
     for c in range(len(place)):
-        difference, speed = _density(f, stride, place[c], part)
+        difference, speed = density_of(f[place[c] :: stride], part)
         for n in range(finer.shape[1]):
-            difference -= _density(g, new_stride, finer[c, n], np.float32(0.0))[0] / np.float32(finer.shape[1])
+            difference -= density_of(g[finer[c, n] :: new_stride], np.float32(0.0))[0] / np.float32(finer.shape[1])
         result[group[c], 0] += difference
         result[group[c], 1] += speed
     return result

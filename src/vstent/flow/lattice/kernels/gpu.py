@@ -21,15 +21,7 @@ import numpy as np
 from numba import config, cuda, njit
 
 from vstent.flow.lattice.kernels import d3q19
-from vstent.flow.lattice.kernels.collision import (
-    collided,
-    collided_screened,
-    moments_of,
-    relaxed,
-    rescaled,
-    stress_size,
-    thinned,
-)
+from vstent.flow.lattice.kernels.collision import collided, collided_screened, relaxed, rescaled, stress_size, thinned
 from vstent.flow.lattice.kernels.d3q19 import INFLOW, KIND, OPENING, OPPOSITE, PRESSURE, WANTED
 from vstent.flow.lattice.kernels.exchange import answered, converted, density_of
 from vstent.kernels.directions import VELOCITIES
@@ -539,32 +531,29 @@ def jumps(f: Any, stride: int, g: Any, new_stride: int, place: Any, finer: Any, 
 
 
 @_inlined
-def _sum_of(values: Any, first: int, last: int, parts: Any, t: int) -> float:
-    """Return the sum of some values; every thread of a block must call it."""
+def _taken(values: Any, first: int, last: int, parts: Any, t: int) -> float:
+    """Return the sum of some values, which become 0; every thread of a block must call it."""
     total = 0.0
     for k in range(first + t, last, THREADS):
         total += values[k]
+        values[k] = 0.0
     result: float = _sum(parts, t, total)
     return result
 
 
 @cuda.jit(cache=True)
 def answer(first: Any, passed: Any, passed_finer: Any, found: Any, held: Any, cells: Any, part: float) -> None:
-    """Set the doubles of a border from what passed it on both grids and from `jumps`; one block per group.
+    """Set what groups lack and their momentum, from what passed on both grids and from `jumps`; one block per group.
 
     `first` (3, g + 1) are the first link of every group on the finer and on the coarser grid, and its first cell
     between. `part` is the volume of a finer cell over that of a coarser one.
     """
     g, t = cuda.blockIdx.x, cuda.threadIdx.x
     parts = cuda.shared.array(THREADS, np.float64)
-    crossed = part * _sum_of(passed_finer, first[0, g], first[0, g + 1], parts, t)
-    crossed -= _sum_of(passed, first[1, g], first[1, g + 1], parts, t)
-    jump = _sum_of(found[0], first[2, g], first[2, g + 1], parts, t)
-    speed = _sum_of(found[1], first[2, g], first[2, g + 1], parts, t)
-    for k in range(first[0, g] + t, first[0, g + 1], THREADS):
-        passed_finer[k] = 0.0
-    for k in range(first[1, g] + t, first[1, g + 1], THREADS):
-        passed[k] = 0.0
+    crossed = part * _taken(passed_finer, first[0, g], first[0, g + 1], parts, t)
+    crossed -= _taken(passed, first[1, g], first[1, g + 1], parts, t)
+    jump = _taken(found[0], first[2, g], first[2, g + 1], parts, t)
+    speed = _taken(found[1], first[2, g], first[2, g + 1], parts, t)
     if t == 0:
         lack, down, up = answered(crossed, jump, speed, (held[0, g], held[1, g], held[2, g]), cells)
         held[0, g], held[1, g], held[2, g] = lack, down, up
@@ -578,32 +567,29 @@ def carry(
     g: Any,
     new_stride: int,
     new_rates: Any,
-    integers: Any,
-    singles: Any,
-    entry: Any,
-    weight: Any,
-    held: Any,
-    row: int,
-    ratio: float,
+    cells: Any,
+    parts: Any,
+    push: Any,
+    ratio: Any,
 ) -> None:
     """Set populations of a grid by interpolation from those of another (see `exchange.carry`).
 
-    The first three arguments are populations, stride and singles of the source, the next three those of the target. The
-    following four are those of `gpu_tables.stencil_of`, and `row` is that of the momentum in `held`.
+    The first three arguments are populations, stride and singles of the source, the next three those of the target, and
+    the following two are from `on_gpu.stencil_of`.
     """
     i = cuda.grid(1)
-    if i >= integers.shape[1]:
+    if i >= cells.shape[1]:
         return
     total, (xx, yy, zz, xy, xz, yz) = _zeros(_ZERO), (_ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO)
-    for e in range(integers[2, i]):
-        even, odd = weight[0, e, i], weight[1, e, i]
-        read = _loaded(f, _homes(stride, entry[e, i]))
+    for e in range(cells[2, i]):
+        even, odd, read = parts[4 + 2 * e, i], parts[5 + 2 * e, i], _loaded(f, _homes(stride, cells[3 + e, i]))
         total = _plus(total, _HALF * (even + odd), _HALF * (even - odd), read)
-        _, u, _ = moments_of(read)
-        xx, yy, zz = xx + even * (u[0] * u[0]), yy + even * (u[1] * u[1]), zz + even * (u[2] * u[2])
-        xy, xz, yz = xy + even * (u[0] * u[1]), xz + even * (u[0] * u[2]), yz + even * (u[1] * u[2])
-    push = np.float32(held[row, integers[1, i]])
-    pushed = _pushed(total, push * singles[1, i], push * singles[2, i], push * singles[3, i])
+        u, v, w = _velocity(read)
+        x, y, z = np.float32(u), np.float32(v), np.float32(w)
+        xx, yy, zz = xx + even * (x * x), yy + even * (y * y), zz + even * (z * z)
+        xy, xz, yz = xy + even * (x * y), xz + even * (x * z), yz + even * (y * z)
+    more = np.float32(push[cells[1, i]])
+    pushed = _pushed(total, more * parts[1, i], more * parts[2, i], more * parts[3, i])
     numbers = ratio, rates[0], (rates[1], rates[2], rates[3], rates[4]), rates[5], new_rates[5]
-    new = converted(pushed, (xx, yy, zz, xy, xz, yz), singles[0, i], numbers)
-    _stored_swapped(g, _homes(new_stride, integers[0, i]), new)
+    new = converted(pushed, (xx, yy, zz, xy, xz, yz), parts[0, i], numbers)
+    _stored_swapped(g, _homes(new_stride, cells[0, i]), new)
