@@ -49,6 +49,8 @@ from vstent.geometry.vessel import Vessel
 from vstent.phantoms import Phantom
 
 TABLE = Path(__file__).with_suffix(".json")
+# Without branches in the sac as much blood enters as leaves, which OpenFOAM misses by up to 15 %: the inflow here is
+# the mean of both.
 INDICES = ("neck_inflow_mL_s", "mean_sac_velocity_m_s", "mean_sac_wss_Pa")
 
 
@@ -104,6 +106,7 @@ def computed(
     else:
         field = simulate_case(case, start=start)
     found = indices(field, case.sac, case.ostium)
+    found = found | {INDICES[0]: 0.5 * (found[INDICES[0]] + found["neck_outflow_mL_s"])}
     values = {key: round(float(found[key]), 6) for key in INDICES}
     print(f"{settings.engine}: {field.advice} {time.perf_counter() - began:.0f} s {values}", flush=True)
     return field, values
