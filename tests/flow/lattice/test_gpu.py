@@ -26,7 +26,7 @@ from vstent.flow.lattice import gpu as gpus, levels, state as lattice_state, ste
 from vstent.flow.lattice.checkpoint import pack
 from vstent.flow.lattice.cost import GPU_BYTES_PER_CELL, estimate, refuse_too_large
 from vstent.flow.lattice.engine import LatticeBoltzmann, PulsatileLatticeBoltzmann
-from vstent.flow.lattice.kernels import d3q19
+from vstent.flow.lattice.kernels import d3q19, exchange, warm
 from vstent.flow.lattice.recording import SEQUENCES, NotRecordedError, Pairs, plan, recorded
 from vstent.flow.lattice.setup import Grid
 from vstent.flow.problem import vessel_case
@@ -107,6 +107,12 @@ for (name, one), other in zip(saved.items(), pack(waits).values()):
 for one in (waits, waits, ahead, ahead):
     step(one)
 assert np.array(waits.history).tobytes() == np.array(ahead.history).tobytes()
+assert ahead.begun_s is not None
+for name in ("built", "links"):  # the force on wires is read from the populations of the last check
+    links = replace(ahead.built[0] if name == "built" else ahead.links, of_wires=np.zeros(1, np.int32))
+    setattr(ahead, name, (links, ahead.built[1]) if name == "built" else links)
+step(ahead)
+assert ahead.begun_s is None
 """
 
 
@@ -262,7 +268,10 @@ def nested(
 def test_levels_exchange_on_a_gpu_as_on_a_processor(
     levels_wanted: int, length_mm: float, reach_mm: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    warm.flow()
     state = nested(levels_wanted, length_mm, reach_mm, monkeypatch)
+    exchanges = exchange.take, exchange.add_crossed, exchange.jumps, exchange.answer, exchange.carry
+    assert [len(kernel.signatures) for kernel in exchanges] == 5 * [1]  # all have been compiled ahead
     simulate(NESTED, tmp_path, state)
     stepping.advance(state, 2)
     if levels_wanted == 2:

@@ -51,8 +51,8 @@ class Device:
         a, links, at = state.addressing, state.links, tables_of(state)
         cells, ends = len(a.place), int(links.start[-1])
         self._at, self._slot = at, layout_of(state).slot
-        self._finer: Device | None = None if state.finer is None else state.finer.device
-        self.stream = cuda.stream() if self._finer is None else self._finer.stream
+        finer: Device | None = None if state.finer is None else state.finer.device
+        self.stream: Any = cuda.stream() if finer is None else finer.stream
         self._populations, self._shape = put(state.populations), put(links.shape)
         self._integers, self._singles, self._doubles = put(at.integers), put(at.singles), put(at.doubles)
         blocks = len(layout_of(state).tables[kernels.BLOCKS])
@@ -74,8 +74,8 @@ class Device:
         self.grid, self.passed = (self._populations, a.stride, self._singles), put(np.zeros(crossing.shape[1]))
         self._cross = Launch(kernels.add_crossed, crossing.shape[1], (self._populations, put(crossing), self.passed))
         self._border = None
-        if self._finer is not None and state.interface is not None:
-            self._border = Border(self, self._finer, state.interface, crossing.shape[1])
+        if finer is not None and state.interface is not None:
+            self._border = Border(self, finer, state.interface, crossing.shape[1])
         density, velocity = put(np.zeros(cells, np.float32)), put(np.zeros((cells, 3), np.float32))
         through_ends = put(np.zeros(ends))
         self._read = (
@@ -151,13 +151,13 @@ class Device:
 
     def _recorded(self) -> dict[tuple[Pairs, int], Any]:
         """Return functions that replay each sequence of pairs; empty where they cannot be recorded."""
-        level: Device | None
         try:
             return {sequence: recorded(partial(self.make, *sequence), self.stream) for sequence in SEQUENCES}
         except NotRecordedError as reason:
-            self._why, stream, level = f", because {reason}", cuda.stream(), self
-            while level is not None:
-                level.stream, level = stream, level._finer
+            self._why, self.stream, level = f", because {reason}", cuda.stream(), self
+            while level._border is not None:
+                level = level._border.finer
+                level.stream = self.stream
             return {}
 
     def make(self, pairs: Pairs, number: int) -> None:
@@ -185,9 +185,9 @@ class Device:
         if goes_home:  # 0 brings populations home and leaves the walls as they are
             part = np.float32(DEFER_PART if is_due else 0.0)
             yield from ((launch, (part,)) for launch in self._settle)
-        if self._finer is not None and self._border is not None:
+        if self._border is not None:
             for half, of_half in enumerate((Pairs.PLAIN, Pairs.LAST)):
-                yield from self._finer.launches(of_half, WIDTH * number + half)
+                yield from self._border.finer.launches(of_half, WIDTH * number + half)
             yield from ((launch, ()) for launch in self._border.couple)
 
     def rescale(self, state: State, stretch: float, stress: float) -> None:
@@ -249,7 +249,7 @@ class Border:
 
     def __init__(self, coarse: Device, fine: Device, between: Interface, links: int) -> None:
         """Copy the coupling to the GPU; `links` is the number of links across borders of the coarser level."""
-        place, finer, group = between.between
+        self.finer, (place, finer, group) = fine, between.between
         order, of_coarse, of_fine = np.argsort(group, kind="stable"), *(one.start for one in between.border)
         of_cells = np.searchsorted(group[order], np.arange(len(of_fine)))
         first = np.stack([of_fine, links - of_coarse[-1] + of_coarse, of_cells]).astype(np.int32)
@@ -258,32 +258,29 @@ class Border:
         jumping = *coarse.grid[:2], *fine.grid[:2], put(place[order]), put(finer[order].T), OF_SHEAR, found
         answering = put(first), coarse.passed, fine.passed, found, self.held, CARRIED_CELLS, 1 / WIDTH**3
         self.take = Launch(kernels.take, len(between.beside), (coarse.grid[0], *beside, self.held))
-        carried = (fine, coarse, between.up, 2, WIDTH), (coarse, fine, between.down, 1, 1 / WIDTH)
-        carrying = (
-            (*source.grid, *target.grid, *stencil_of(along), self.held[row], np.float32(ratio))
-            for source, target, along, row, ratio in carried
-        )
+        up = *fine.grid, *coarse.grid, *stencil_of(between.up, WIDTH), self.held[2]
+        down = *coarse.grid, *fine.grid, *stencil_of(between.down, 1 / WIDTH), self.held[1]
         self.couple = (
             Launch(kernels.jumps, len(place), jumping),
             Launch(kernels.answer, len(between.lack) * THREADS, answering),
-            Launch(kernels.carry, len(between.up.target), next(carrying)),
-            Launch(kernels.carry, len(between.down.target), next(carrying)),
+            Launch(kernels.carry, len(between.up.target), up),
+            Launch(kernels.carry, len(between.down.target), down),
         )
 
 
-def stencil_of(along: Stencil) -> tuple[Any, Any]:
+def stencil_of(along: Stencil, ratio: float) -> tuple[Any, Any]:
     """Return a stencil of n cells with k entries at most on the GPU; neighbouring threads read neighbouring values.
 
-    It is (3 + k, n) storage place, group and number of entries, and storage places of the cells read, and (4 + 2 k, n)
-    limit and shares, and weights.
+    It is (3 + k, n) storage place, group, number of entries, and storage places of the cells read, and (5 + 2 k, n)
+    limit, shares, ratio of the spacings, and weights.
     """
     count = np.diff(along.start)
     target = np.repeat(np.arange(len(count)), count)
     entry, most = np.arange(len(target)) - along.start[target], int(count.max(initial=0))
-    cells, parts = np.zeros((3 + most, len(count)), np.int32), np.zeros((4 + 2 * most, len(count)), np.float32)
-    cells[:3], parts[0], parts[1:4] = (along.target, along.group, count), along.limit, along.share.T
+    cells, parts = np.zeros((3 + most, len(count)), np.int32), np.zeros((5 + 2 * most, len(count)), np.float32)
+    cells[:3], parts[0], parts[1:4], parts[4] = (along.target, along.group, count), along.limit, along.share.T, ratio
     cells[3 + entry, target] = along.place[along.cell]
-    parts[4 + 2 * entry, target], parts[5 + 2 * entry, target] = along.weight.T
+    parts[5 + 2 * entry, target], parts[6 + 2 * entry, target] = along.weight.T
     return put(cells), put(parts)
 
 

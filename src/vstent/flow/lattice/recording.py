@@ -25,13 +25,11 @@ class Pairs(Enum):
     """`DEFER_PAIRS` pairs, of which walls are updated after the first."""
 
 
-Sequence = tuple[Pairs, int]
-"""Pairs with the number of the first one since the last time that walls were due to be updated."""
 SEQUENCES: Final = ((Pairs.ROUND, 0), *product((Pairs.LAST, Pairs.PLAIN), range(DEFER_PAIRS)))
-"""All that `plan` yields."""
+"""All that `plan` yields: pairs, and the number of the first since walls were last due to be updated."""
 
 
-def plan(first_pair: int, count: int) -> Iterator[Sequence]:
+def plan(first_pair: int, count: int) -> Iterator[tuple[Pairs, int]]:
     """Yield the sequences that make up `count` pairs of steps; populations are at home after the last.
 
     The number of the first pair counts from the last check; walls are due to be updated after every `DEFER_PAIRS`-th.

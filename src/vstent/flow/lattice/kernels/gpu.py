@@ -561,16 +561,7 @@ def answer(first: Any, passed: Any, passed_finer: Any, found: Any, held: Any, ce
 
 @cuda.jit(cache=True)
 def carry(
-    f: Any,
-    stride: int,
-    rates: Any,
-    g: Any,
-    new_stride: int,
-    new_rates: Any,
-    cells: Any,
-    parts: Any,
-    push: Any,
-    ratio: Any,
+    f: Any, stride: int, rates: Any, g: Any, new_stride: int, new_rates: Any, cells: Any, parts: Any, push: Any
 ) -> None:
     """Set populations of a grid by interpolation from those of another (see `exchange.carry`).
 
@@ -582,7 +573,7 @@ def carry(
         return
     total, (xx, yy, zz, xy, xz, yz) = _zeros(_ZERO), (_ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO)
     for e in range(cells[2, i]):
-        even, odd, read = parts[4 + 2 * e, i], parts[5 + 2 * e, i], _loaded(f, _homes(stride, cells[3 + e, i]))
+        even, odd, read = parts[5 + 2 * e, i], parts[6 + 2 * e, i], _loaded(f, _homes(stride, cells[3 + e, i]))
         total = _plus(total, _HALF * (even + odd), _HALF * (even - odd), read)
         u, v, w = _velocity(read)
         x, y, z = np.float32(u), np.float32(v), np.float32(w)
@@ -590,6 +581,6 @@ def carry(
         xy, xz, yz = xy + even * (x * y), xz + even * (x * z), yz + even * (y * z)
     more = np.float32(push[cells[1, i]])
     pushed = _pushed(total, more * parts[1, i], more * parts[2, i], more * parts[3, i])
-    numbers = ratio, rates[0], (rates[1], rates[2], rates[3], rates[4]), rates[5], new_rates[5]
+    numbers = parts[4, i], rates[0], (rates[1], rates[2], rates[3], rates[4]), rates[5], new_rates[5]
     new = converted(pushed, (xx, yy, zz, xy, xz, yz), parts[0, i], numbers)
     _stored_swapped(g, _homes(new_stride, cells[0, i]), new)
