@@ -212,7 +212,8 @@ def step(state: State) -> None:
             if state.case.resistances and len(state.history) % len(state.pace) == 0:
                 _follow(state)
             _keep_pace(state)
-            if state.device is not None and state.levels == state.kept and not len(state.levels[-1].links.of_wires):
+            are_walls = any(len(level.links.of_wires) for level in state.levels)
+            if state.device is not None and state.levels == state.kept and not are_walls:
                 with told():
                     if state.device.begin(*_pairs(state, _slice_steps(state))):
                         state.begun_s = perf_counter()
