@@ -148,8 +148,8 @@ def _grids(case: FlowCase, cell_size_mm: float) -> list[tuple[Grid, Interface | 
     part = (case.sac, case.numerics.close_up) if len(sizes) > 1 else None
     key = sizes, part, case.solids if are_walls else ()
     if key not in built:
-        for of_walls in [other for other in built if other[2]]:  # of another device, or of another tile of it
-            del built[of_walls]
+        for others in [other for other in built if other[2] and are_walls]:  # of another device, or tile of it
+            del built[others]
         domain = domains.build(case.vessel, coarsest_mm, wires=domains.wires_of(case, coarsest_mm))
         limit = thickest(case, domain)
         grids: list[tuple[Grid, Interface | None]] = [(Grid(domain, limit, address(domain, limit)), None)]
