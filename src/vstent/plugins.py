@@ -16,13 +16,7 @@ Group = Literal["vstent.devices", "vstent.engines"]
 
 
 def plugins(group: Group) -> dict[str, EntryPoint]:
-    """Return the installed entry points of a group by name.
-
-    Raises
-    ------
-    PluginError
-        Two packages use one name.
-    """
+    """Return the installed entry points of a group by name; PluginError is raised where two packages use one name."""
     found: dict[str, EntryPoint] = {}
     for entry in entry_points(group=group):
         if entry.name in found and found[entry.name].value != entry.value:
@@ -35,12 +29,9 @@ def plugins(group: Group) -> dict[str, EntryPoint]:
 
 
 def load(group: Group, name: str, *, built_in: str) -> Any:
-    """Load a plug-in of a group by its name; an error lists the built-in choices too.
+    """Load a plug-in of a group by its name.
 
-    Raises
-    ------
-    PluginError
-        No plug-in has that name, or it cannot be loaded.
+    PluginError is raised where none has that name, listing the built-in choice too, or where it cannot be loaded.
     """
     found = plugins(group)
     if name not in found:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from tubes import arc, line, tube, with_neck
 
-from vstent.deployment.crumpling import CRUMPLED_FRACTION, Crumpling, cells, crumpling, place_of_narrowest
+from vstent.deployment.crumpling import CRUMPLED_FRACTION, Cells, cells, place_of_narrowest
 from vstent.deployment.deploy import deploy
 from vstent.deployment.measure import measure
 from vstent.devices import catalogue
@@ -67,17 +67,19 @@ def test_a_cell_that_is_turned_about_its_height_is_as_wide_as_its_cosine(turn_ra
     )
     nodes_mm[row * shape.row_split, columns * shape.column_split] = middle_mm + turned_mm
     changed = replace(stent, nodes_mm=nodes_mm)
-    found = crumpling(artery(), changed)
+    found = cells(changed, artery().parent.axis)
     diameter_mm = [one.row_diameter_mm[row * shape.row_split] for one in (stent, changed)]
-    width = cells(changed, artery().parent.axis).width_fraction
+    width = found.width_fraction
     lattice_row, cells_around = row - 1, shape.lattice_columns // 2
     of_row = slice(lattice_row * cells_around, (lattice_row + 1) * cells_around)
     expected = np.cos(turn_rad) * diameter_mm[0] / diameter_mm[1]
     assert np.abs(width[of_row] - expected).min() < 0.005
     if turn_rad > 1.0:
-        assert found.narrowest_fraction == pytest.approx(expected, abs=0.005)
-        assert found.crumpled_count >= 1
-        assert found.abscissa_mm == pytest.approx(stent.row_abscissa_mm[row * shape.row_split], abs=0.3)
+        assert width[found.narrowest] == pytest.approx(expected, abs=0.005)
+        assert found.n_crumpled >= 1
+        assert found.abscissa_mm[found.narrowest] == pytest.approx(
+            stent.row_abscissa_mm[row * shape.row_split], abs=0.3
+        )
 
 
 @pytest.mark.parametrize("design", [ENTERPRISE, PIPELINE])
@@ -135,8 +137,7 @@ def test_a_bend_in_one_direction_crumples_no_cell(bend_mm):
 
 def test_two_bends_in_opposite_directions_crumple_cells_and_the_advice_says_where():
     done = deployed(ENTERPRISE, siphon())
-    found = crumpling(siphon(), done.stent)
-    count, measures = found.crumpled_count, measure(siphon(), done)
+    count, measures = cells(done.stent, siphon().parent.axis).n_crumpled, measure(siphon(), done)
     assert measures["crumpled_cells_count"] == count > 2
     assert measures["crumpled_cells_fraction"] == count / 72
     assert measures["min_cell_width_fraction"] < 0.2
@@ -160,7 +161,7 @@ def test_two_bends_in_opposite_directions_crumple_cells_and_the_advice_says_wher
 )
 def test_the_place_is_told_from_the_nearer_end_of_the_neck(at_mm, inward, said):
     anatomy = with_neck(artery(), 13.5, 18.5)
-    assert place_of_narrowest(anatomy, Crumpling(0.1, at_mm, inward, 1, 72)) == said
+    assert place_of_narrowest(anatomy, Cells(*np.array([[0.1], [at_mm], [inward]]))) == said
 
 
 def test_a_free_crown_that_moves_along_the_artery_leaves_the_width_of_its_cells():

@@ -16,9 +16,9 @@ from vstent.devices.catalogue import catalogue, find_design, find_size
 from vstent.devices.ranges import MARGIN, altered, uncertain, values_at
 from vstent.devices.stent import Landing
 from vstent.errors import VstentError
-from vstent.plan.bands import INTERVAL, SAMPLES, bands, gap_bands, interval, length_band
+from vstent.plan.bands import SAMPLES, bands, gap_bands, interval, length_band
 from vstent.plan.rank import rank
-from vstent.plan.shares import centered_points
+from vstent.plan.shares import INTERVAL, centered_points
 from vstent.reporting.uncertainty import band_rows, ends, how_sure, number_name
 
 SILK = find_design("silk")

@@ -7,12 +7,12 @@ import pydicom
 import pytest
 from PIL import Image
 
+from vstent.angiography.curves import Curves
 from vstent.angiography.film import PAPER, Film
 from vstent.angiography.view import View, angles_of
 from vstent.reporting.films import (
     CAPTION_PX,
     GAP_PX,
-    Density,
     Shown,
     beside,
     kept_films,
@@ -43,7 +43,7 @@ def test_key_frames_are_half_peak_half_and_5_s_after():
 
 
 def test_films_side_by_side_keep_their_pixels_below_the_captions():
-    pair = [Shown("Before", film()), Shown("Silk", film(3.0), wires=np.full((32, 48), 0.1, np.float32))]
+    pair = [Shown("Before", film()), Shown("Silk", film(3.0), wires=[np.full((32, 48), 0.1, np.float32)])]
     frames = beside(pair, 0.8)
     assert len(frames) == 81
     assert frames[0].shape == (32 + CAPTION_PX, 2 * 48 + GAP_PX)
@@ -77,7 +77,7 @@ def test_files_hold_the_same_grey(tmp_path):
 def test_the_report_finds_the_films_of_a_case(tmp_path):
     assert kept_films(tmp_path) is None
     shown, time_s = {"bare": Shown("Before", film())}, np.linspace(0, 1, 5)
-    write_films(tmp_path / "angiogram", shown, [Density("Before", time_s, 40 * time_s, 50 * time_s)])
+    write_films(tmp_path / "angiogram", shown, {"Before": Curves(time_s, 40 * time_s, 50 * time_s)})
     kept = kept_films(tmp_path)
     assert kept.animation == (tmp_path / "angiogram" / "angiogram.webp").read_bytes()
     assert [one.id for one in kept.pictures] == ["key_frames", "density"]

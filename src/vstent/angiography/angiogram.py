@@ -14,6 +14,7 @@ from vstent.angiography.curves import Curves
 from vstent.angiography.grid import Grid, grid_of
 from vstent.angiography.network import Network, period_s
 from vstent.angiography.transport import Frame, Transport
+from vstent.angiography.view import check_range
 from vstent.angiography.washout import MOMENTS_S, STAYED, Washout, wash_out
 from vstent.errors import FlowError, InputError
 from vstent.flow.case import FlowCase, FlowField
@@ -59,12 +60,9 @@ class AngiogramSettings:
 
     def __post_init__(self) -> None:
         """Raise InputError where a value cannot be used."""
-        if not 0.1 <= self.window_s <= 120:
-            raise InputError(f"a window of {self.window_s:g} s cannot be computed: give 0.1 to 120 s")
-        if not 0.5 <= self.frames_per_s <= 120:
-            raise InputError(f"{self.frames_per_s:g} frames per s cannot be computed: give 0.5 to 120")
-        if not 0 <= self.diffusivity_mm2_s <= 1:
-            raise InputError(f"a diffusivity of {self.diffusivity_mm2_s:g} mm2/s is not possible: give 0 to 1 mm2/s")
+        check_range("window", self.window_s, 0.1, 120, "s")
+        check_range("frame rate", self.frames_per_s, 0.5, 120, "per second")
+        check_range("diffusivity", self.diffusivity_mm2_s, 0, 1, "mm2/s")
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,16 +138,11 @@ def angiogram(
 
     Parameters
     ----------
-    anatomy : Anatomy
-        The patient's vessel and aneurysms.
-    field : FlowField
-        Flow without or with a device, steady or pulsatile.
-    settings : AngiogramSettings, optional
-        Injection, window and frame rate.
-    watch : callable, optional
-        Takes the cell centers and edges and returns a function that is called with every frame (see `Watch`).
-    progress : callable, optional
-        Called with the finished fraction.
+    anatomy : the patient's vessel and aneurysms.
+    field : flow without or with a device, steady or pulsatile.
+    settings : injection, window and frame rate.
+    watch : takes the cell centers and edges and returns a function that is called with every frame (see `Watch`).
+    progress : called with the finished fraction.
 
     Raises
     ------

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vstent.angiography.projection import Projector, projector_of
-from vstent.angiography.view import View
+from vstent.angiography.view import View, check_range
 from vstent.devices.stent import Stent
 from vstent.errors import InputError
 from vstent.flow.media import cut
@@ -87,18 +87,11 @@ def film_of(
 
     Frames between two given times are interpolated linearly.
     """
-    check_frame_rate(frame_rate_Hz)
+    check_range("frame rate", frame_rate_Hz, *FRAME_RATES_HZ, "per second")
     per_mg_mL_mm = iodine_cm2_g(energy_keV) * CM2_G_PER
     shadows = ((time_s, projector(values) * np.float32(per_mg_mL_mm)) for time_s, values in frames)
     found = list(_resampled(shadows, 1.0 / frame_rate_Hz))
     return Film(projector.view, np.array([time_s for time_s, _ in found]), np.stack([one for _, one in found]))
-
-
-def check_frame_rate(frame_rate_Hz: float) -> None:
-    """Raise InputError where a frame rate is out of range."""
-    low, high = FRAME_RATES_HZ
-    if not low <= frame_rate_Hz <= high:
-        raise InputError(f"A frame rate of {frame_rate_Hz:g} per second is out of range. Give {low:g} to {high:g}.")
 
 
 def _resampled(
@@ -121,28 +114,28 @@ def _resampled(
 
 def wire_shadow(view: View, stent: Stent) -> NDArray[np.float32]:
     """Return the absorption (rows, columns) by the wires of a deployed device."""
-    ends = stent.piece_starts
-    vectors = stent.wire_points_mm[ends + 1] - stent.wire_points_mm[ends]
+    first_mm, last_mm, half_mm = stent.pieces_mm
+    vectors = last_mm - first_mm
     lengths = curves.lengths(vectors)
     count, piece, part = cut(lengths, WIRE_STEP_MM)
-    points_mm = stent.wire_points_mm[ends][piece] + part[:, None] * vectors[piece]
-    diameter_mm = 1e-3 * stent.wire_diameter_um[stent.point_wires[ends]][piece]
-    volume_mm3 = np.pi / 4 * diameter_mm**2 * lengths[piece] / count[piece]
+    points_mm = first_mm[piece] + part[:, None] * vectors[piece]
+    volume_mm3 = np.pi / 4 * (2 * half_mm[piece]) ** 2 * lengths[piece] / count[piece]
     projector = projector_of(view, points_mm, np.cbrt(volume_mm3))
     return projector(np.full(len(piece), WIRE_PER_MM))
 
 
 def levels_of(
-    film: Film, window: float, *, wires: NDArray[np.float32] | None = None, vessel: NDArray[np.float32] | None = None
+    film: Film, window: float, *, wires: Sequence[NDArray[np.float32]] = (), vessel: NDArray[np.float32] | None = None
 ) -> Iterator[NDArray[np.float32]]:
     """Yield the grey levels (rows, columns) of every frame, 0 (black) to 1 (white).
 
     As on a subtracted film, the level falls linearly with the logarithm of the intensity. The absorption `window` is
-    shown black. The absorption by wires, and faintly the path length within the lumen, are added where they are given.
+    shown black. The absorption by every device's wires, and faintly the path length within the lumen, are added where
+    they are given.
     """
     still = np.zeros(film.absorption.shape[1:], np.float32)
-    if wires is not None:
-        still += wires
+    for shadow in wires:
+        still += shadow
     if vessel is not None:
         still += np.float32(FAINT * window / max(float(vessel.max()), 1e-9)) * vessel
     for frame in film.absorption:

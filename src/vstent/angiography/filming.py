@@ -7,10 +7,10 @@ from typing import Final
 import numpy as np
 from scipy.sparse import csc_array
 
-from vstent.angiography.film import ENERGY_KEV, check_frame_rate, iodine_cm2_g
+from vstent.angiography.film import ENERGY_KEV, FRAME_RATES_HZ, iodine_cm2_g
 from vstent.angiography.history import History
 from vstent.angiography.projection import Projector, projector_of
-from vstent.angiography.view import PIXEL_MM, SOURCE_DETECTOR_MM, SOURCE_ISOCENTER_MM, View, fitted
+from vstent.angiography.view import PIXEL_MM, SOURCE_DETECTOR_MM, SOURCE_ISOCENTER_MM, View, check_range, fitted
 
 SOME: Final = 20_000
 """Number of cells that determine the size of the detector."""
@@ -38,7 +38,7 @@ class FilmSettings:
     """Whether the lumen is shown faintly."""
 
     def __post_init__(self) -> None:
-        check_frame_rate(self.frame_rate_Hz)
+        check_range("frame rate", self.frame_rate_Hz, *FRAME_RATES_HZ, "per second")
         iodine_cm2_g(self.energy_keV)
         View(*(self.angles_rad or (0.0, 0.0)), np.zeros(3), 16, 16, *self.distances_mm)
 

@@ -61,11 +61,11 @@ class View:
     def __post_init__(self) -> None:
         freeze(self, "isocenter_mm", np.float64, (3,))
         _check_angles(self.primary_rad, self.secondary_rad)
-        _check("source-detector distance", self.source_detector_mm, 300.0, 3000.0, "mm")
-        _check("source-isocenter distance", self.source_isocenter_mm, 100.0, self.source_detector_mm, "mm")
-        _check("detector pixel", self.pixel_mm, 0.02, 5.0, "mm")
+        check_range("source-detector distance", self.source_detector_mm, 300.0, 3000.0, "mm")
+        check_range("source-isocenter distance", self.source_isocenter_mm, 100.0, self.source_detector_mm, "mm")
+        check_range("detector pixel", self.pixel_mm, 0.02, 5.0, "mm")
         for name, count in (("rows", self.rows), ("columns", self.columns)):
-            _check(f"number of detector {name}", count, 8, MAX_PIXELS, "")
+            check_range(f"number of detector {name}", count, 8, MAX_PIXELS, "")
 
     @property
     def name(self) -> str:
@@ -148,11 +148,11 @@ def fitted(
 
 def _check_angles(primary_rad: float, secondary_rad: float) -> None:
     """Raise InputError where an angle is outside the range that DICOM defines."""
-    _check("LAO or RAO angle", abs(float(np.degrees(primary_rad))), 0.0, 180.0, "degrees")
-    _check("CRA or CAU angle", abs(float(np.degrees(secondary_rad))), 0.0, 90.0, "degrees")
+    check_range("LAO or RAO angle", abs(float(np.degrees(primary_rad))), 0.0, 180.0, "degrees")
+    check_range("CRA or CAU angle", abs(float(np.degrees(secondary_rad))), 0.0, 90.0, "degrees")
 
 
-def _check(name: str, value: float, low: float, high: float, unit: str) -> None:
+def check_range(name: str, value: float, low: float, high: float, unit: str) -> None:
     """Raise InputError where a value is not a number from `low` to `high`."""
     if not low <= value <= high + 1e-9:
         of = f" {unit}" if unit else ""

@@ -65,8 +65,7 @@ def films_message(
         window = max(window, length_mm * most_mg_mL * iodine_cm2_g(ENERGY_KEV) * CM2_G_PER)
     for name, history in histories.items():
         film = _film(history, projectors[name], moment)
-        shadows = [wire_shadow(view, stent) for stent in stents.get(name, ())]
-        wires = np.sum(shadows, axis=0) if shadows else None
+        wires = [wire_shadow(view, stent) for stent in stents.get(name, ())]
         levels = np.stack([np.rint(LEVELS * one) for one in levels_of(film, window, wires=wires)]).astype(np.uint8)
         panes.append({"id": name, "frames": packer.add(levels)})
         times_s = history.time_s

@@ -25,24 +25,13 @@ KINDS: Final = {
 FIRST: Final = {"anatomy": "image", "rank": "device", "place": "deploy", "flow": "flow", "angiogram": "flow"}
 """Step that each kind of job shows before its first progress message."""
 STAGES: Final = {
-    "scan": "image",
-    "segment": "image",
-    "vessel": "vessel",
-    "trace": "vessel",
-    "trim": "vessel",
-    "anatomy": "sac",
-    "restore": "sac",
-    "rank": "device",
-    "rank_flow": "device",
-    "deploy": "deploy",
-    "struts": "deploy",
-    "plan": "flow",
-    "flow": "flow",
-    "angiogram": "flow",
-    "film": "report",
-    "measure": "report",
-    "vary": "report",
-    "report": "report",
+    **dict.fromkeys(("scan", "segment"), "image"),
+    **dict.fromkeys(("vessel", "trace", "trim"), "vessel"),
+    **dict.fromkeys(("anatomy", "restore"), "sac"),
+    **dict.fromkeys(("rank", "rank_flow"), "device"),
+    **dict.fromkeys(("deploy", "struts"), "deploy"),
+    **dict.fromkeys(("plan", "flow", "angiogram"), "flow"),
+    **dict.fromkeys(("film", "measure", "vary", "report"), "report"),
 }
 """Step of the page for the first word of a study's stage."""
 STOPPED: Final = "Stopped. Finished results are kept."

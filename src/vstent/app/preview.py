@@ -50,25 +50,8 @@ from vstent.io.archive import load_data
 from vstent.kernels import curves, triangles
 from vstent.kernels.arrays import Floats
 from vstent.plan.bands import gap_bands
+from vstent.reporting import scene
 from vstent.reporting.packing import message
-from vstent.reporting.scene import (
-    NECK_COLOUR,
-    LineLayer,
-    MeshLayer,
-    anatomy_layers,
-    closed_layer,
-    contour_layer,
-    flow_layers,
-    implant_titles,
-    node_coverage,
-    own_layers,
-    scales_of,
-    treatment_title,
-    view_of,
-    views_of,
-    wire_layer,
-    wires_of,
-)
 from vstent.reporting.uncertainty import band_rows, how_sure
 from vstent.study.folder import CACHE
 from vstent.study.keys import ALONE, STRAIGHTENED, flow_stage, stage_name, study_keys
@@ -229,25 +212,25 @@ class Preview:
 
         return self._of_implant("metrics", treatment, implant, compute)
 
-    def _wires(self, pane: str, treatment: Treatment, colour: Colour) -> list[LineLayer]:
+    def _wires(self, pane: str, treatment: Treatment, colour: Colour) -> list[scene.LineLayer]:
         """Return the wires of the deployed implants of a treatment."""
         layers = []
         for implant in treatment.implants:
             found = self.deployment(treatment, implant)
-            measured = partial(node_coverage, found.stent)
+            measured = partial(scene.node_coverage, found.stent)
             coverage = partial(self._of_implant, "coverage", treatment, implant, measured)
             layers.append(_wires(pane, found, colour, coverage))
         return layers
 
-    def _drawn(self, pane: str, treatment: Treatment, colour: Colour) -> list[MeshLayer | LineLayer]:
+    def _drawn(self, pane: str, treatment: Treatment, colour: Colour) -> scene.Layers:
         """Return wires and contours of a deployed treatment in a pane."""
         meshes = [one for one in self.deployed(treatment).values() if not isinstance(one.stent, Coils)]
-        contours = [contour_layer(pane, one, self.anatomy) for one in meshes]
+        contours = [scene.contour_layer(pane, one, self.anatomy) for one in meshes]
         return [*self._wires(pane, treatment, colour), *contours]
 
     def _sheets(self, treatment: Treatment) -> list[dict[str, Any]]:
         """Return the tables of the deployed implants of a treatment."""
-        titles = implant_titles(self.deployed(treatment))
+        titles = scene.implant_titles(self.deployed(treatment))
         found = [sheets.device(titles[one.id], self._measures(treatment, one)) for one in treatment.implants]
         if len(found) > 1:
             key, stents = ("together", self.case.state.anatomy, treatment.implants), self.stents(treatment)
@@ -287,17 +270,17 @@ class Preview:
 
     def _flow_layers(
         self, name: str, path: Path, moment: int | None, yielded: Straightening | None = None
-    ) -> list[MeshLayer | LineLayer]:
+    ) -> scene.Layers:
         """Return the layers of a flow, with its cut: of its mean, or of one moment of its last cycle.
 
         With an artery that has yielded come its wall and the devices in it.
         """
 
-        def draw() -> list[MeshLayer | LineLayer]:
+        def draw() -> scene.Layers:
             shown, anatomy = self._flow(path, moment), self.anatomy if yielded is None else yielded.anatomy
-            own = [] if yielded is None else own_layers(name, anatomy)
-            wires = [] if yielded is None else [wire_layer(name, one.stent) for one in yielded.deployed]
-            return [*flow_layers(name, shown, anatomy), cut(name, shown, self.anatomy), *own, *wires]
+            own = [] if yielded is None else scene.own_layers(name, anatomy)
+            wires = [] if yielded is None else [scene.wire_layer(name, one.stent) for one in yielded.deployed]
+            return [*scene.flow_layers(name, shown, anatomy), cut(name, shown, self.anatomy), *own, *wires]
 
         return self._cached(("layers", path, path.stat().st_mtime_ns, self.case.state.anatomy, moment), draw)
 
@@ -311,9 +294,7 @@ class Preview:
         flow = self._loaded(path, FlowField)
         return flow if moment is None or not flow.phases else flow.at_phase(flow.phases[moment % len(flow.phases)])
 
-    def _yielded(
-        self, pane: str, stents: Sequence[Stent], layers: list[MeshLayer | LineLayer]
-    ) -> tuple[list[MeshLayer | LineLayer], dict[str, Any]]:
+    def _yielded(self, pane: str, stents: Sequence[Stent], layers: scene.Layers) -> tuple[scene.Layers, dict[str, Any]]:
         """Return the layers of devices, in the artery that yields to them where it does, and what a message states."""
         setting, anatomy = self.case.state.choices.straightening, self.anatomy
         if setting == "off" or not stents:
@@ -388,14 +369,14 @@ class Preview:
         radius_mm = anatomy.parent.section_radius_mm
         span_mm = list(anatomy.parent.span_mm(anatomy.aneurysms[0])) if anatomy.aneurysms else []
         # The profile shows the artery around the neck, the view of the whole vessel is from the same side.
-        profile, *others = views_of(anatomy)
+        profile, *others = scene.views_of(anatomy)
         low_mm, high_mm = span_mm or (0.0, axis.length_mm)
         is_near = (axis.abscissa_mm > low_mm - BESIDE_MM) & (axis.abscissa_mm < high_mm + BESIDE_MM)
         treated = np.concatenate([axis.points_mm[is_near], *(one.sac.vertices_mm for one in anatomy.aneurysms[:1])])
-        whole = view_of("whole", profile.axes, anatomy.vessel.lumen.vertices_mm)
+        whole = scene.view_of("whole", profile.axes, anatomy.vessel.lumen.vertices_mm)
         return message(
-            [*anatomy_layers(anatomy), *(_disc(k, opening) for k, opening in enumerate(openings))],
-            views=[view_of("profile", profile.axes, treated, 1.15), whole, *others],
+            [*scene.anatomy_layers(anatomy), *(_disc(k, opening) for k, opening in enumerate(openings))],
+            views=[scene.view_of("profile", profile.axes, treated, 1.15), whole, *others],
             fade=1.2 * float(np.median(radius_mm)),
             axis=_axis(axis.points_mm, axis.abscissa_mm) | {"diameter": np.round(2 * radius_mm, 3).tolist()},
             own_mm=anatomy.parent.own_mm,
@@ -425,7 +406,7 @@ class Preview:
             curve = np.array(curve_mm, dtype=np.float64)
             if handle is not None and to_mm is not None:
                 curve = necks.pulled(self.anatomy, curve, handle, np.array(to_mm, dtype=np.float64))
-            return message([closed_layer("neck", [curve], 0.08, NECK_COLOUR)], neck=necks.told(curve))
+            return message([scene.closed_layer("neck", [curve], 0.08, scene.NECK_COLOUR)], neck=necks.told(curve))
 
     def anatomy_sheet(self) -> list[dict[str, Any]]:
         """Return the metrics of the anatomy."""
@@ -496,7 +477,9 @@ class Preview:
             wires = [_wires(pane, one, colour, partial(_covered, one.stent)) for one in drawn.values()]
             layers, yields = self._yielded(pane, self.shown, [*wires])
             place = self._place(_implant(treatment, implant), drawn[implant].stent, drawn[implant])
-            return message(layers, scales_of(layers, self.anatomy), treatment=pane, implant=implant, **place, **yields)
+            return message(
+                layers, scene.scales_of(layers, self.anatomy), treatment=pane, implant=implant, **place, **yields
+            )
 
     def deployment_message(self, treatment: Treatment, implant: str, colour: Colour) -> bytes:
         """Return a deployed treatment with its expansion and its metrics, and the place of one of its implants."""
@@ -507,13 +490,13 @@ class Preview:
             layers, yields = self._yielded(treatment.name, self.shown, self._drawn(treatment.name, there, colour))
             told: dict[str, Any] = {"treatment": treatment.name, "implant": implant, **yields}
             told |= {
-                "title": treatment_title(deployed),
+                "title": scene.treatment_title(deployed),
                 "measures": self._sheets(there),
                 "is_placed": there == treatment,
             }
             if implant not in deployed:
                 told |= {"device": chosen.device, "is_coils": True, "advice": NOT_PLACED}
-                return message(layers, scales_of(layers, self.anatomy), **told)
+                return message(layers, scene.scales_of(layers, self.anatomy), **told)
             found, stent = deployed[implant], deployed[implant].stent
             sketched: Sketch | None = None
             if _is_sketched(treatment, chosen):
@@ -522,7 +505,7 @@ class Preview:
                 sketched = laid_inside(partial(sketch, wall), landing or Landing(stent.middle_abscissa_mm))
             return message(
                 layers,
-                scales_of(layers, self.anatomy),
+                scene.scales_of(layers, self.anatomy),
                 **told,
                 **self._place(chosen, stent, sketched),
                 advice=found.advice,
@@ -531,13 +514,13 @@ class Preview:
     def comparison_message(self, treatments: Sequence[Treatment], colour: Colour) -> bytes:
         """Return several deployed treatments, each in a pane of its own, on common color scales."""
         with LOCK:
-            layers: list[MeshLayer | LineLayer] = []
+            layers: scene.Layers = []
             told = []
             for number, treatment in enumerate(treatments):
-                pane, title = f"compared {number}", treatment_title(self.deployed(treatment))
+                pane, title = f"compared {number}", scene.treatment_title(self.deployed(treatment))
                 layers += self._drawn(pane, treatment, colour)
                 told.append({"pane": pane, "title": title, "measures": self._sheets(treatment)})
-            return message(layers, scales_of(layers, self.anatomy), compared=told)
+            return message(layers, scene.scales_of(layers, self.anatomy), compared=told)
 
     def flow_message(self, moment: int | None, cut_mm: float | None = None) -> bytes:
         """Return wall shear stress, streamlines and a cut of every flow, or another cut alone, on common color scales.
@@ -565,7 +548,7 @@ class Preview:
                 of_scales = self._flow_layers(BARE, paths[BARE], most)
             return message(
                 layers,
-                scales_of(of_scales, self.anatomy),
+                scene.scales_of(of_scales, self.anatomy),
                 times_s=[phase.time_s for phase in phases],
                 moment=moment if phases else None,
                 panes=list(paths),
@@ -600,31 +583,28 @@ class Preview:
             at_mm = float(np.clip(abscissa_mm, 0.0, anatomy.parent.axis.length_mm))
             center, frame = (found[0] for found in across.at(np.array([at_mm])))
             radius_mm = float(np.interp(at_mm, anatomy.parent.axis.abscissa_mm, anatomy.parent.section_radius_mm))
-            shown = {
+            shown: dict[str, Any] = {
                 "abscissa_mm": at_mm,
                 "artery_diameter_mm": 2 * radius_mm,
                 "lumen": _section(anatomy.vessel.lumen, center, frame),
                 "landing": _section(anatomy.parent.landing_surface, center, frame),
             }
             deployed: dict[str, Deployment] = {} if name is None else self.deployed(self.placed(self.choice(name)))
-            rings: list[Any] = []
             if not deployed:
                 return shown
-            rows = {key: _row_at(one.stent, at_mm) for key, one in deployed.items()}
-            for key, row in rows.items():
-                if row is not None:
-                    ring = (deployed[key].stent.nodes_mm[row] - center) @ frame[1:].T
-                    rings.append(np.round(np.append(ring, ring[:1], axis=0), 3).ravel().tolist())
-            shown_id = implant if implant and implant in deployed else next(iter(deployed))
-            at_row, stent = rows[shown_id], deployed[shown_id].stent
-            if at_row is None:
-                return shown | {"rings": rings}
-            return shown | {
-                "rings": rings,
-                "device_diameter_mm": float(stent.row_diameter_mm[at_row]),
-                "free_diameter_mm": float(free_diameters_mm(stent.design, stent.size)[at_row]),
-                "max_gap_mm": float(deployed[shown_id].wall_gap_mm[at_row].max()),
-            }
+            shown["rings"], shown_id = [], implant if implant in deployed else next(iter(deployed))
+            for key, one in deployed.items():
+                if (row := _row_at(one.stent, at_mm)) is None:
+                    continue
+                ring = (one.stent.nodes_mm[row] - center) @ frame[1:].T
+                shown["rings"].append(np.round(np.append(ring, ring[:1], axis=0), 3).ravel().tolist())
+                if key == shown_id:
+                    shown |= {
+                        "device_diameter_mm": float(one.stent.row_diameter_mm[row]),
+                        "free_diameter_mm": float(free_diameters_mm(one.stent.design, one.stent.size)[row]),
+                        "max_gap_mm": float(one.wall_gap_mm[row].max()),
+                    }
+            return shown
 
 
 def _flow_name(name: str, end: str) -> str:
@@ -657,7 +637,7 @@ def _opening_colour(opening: Opening) -> tuple[float, float, float]:
     return OPENING_COLOURS[number] if number < len(OPENING_COLOURS) else (0.45, 0.50, 0.54)
 
 
-def _disc(number: int, opening: Opening) -> MeshLayer:
+def _disc(number: int, opening: Opening) -> scene.MeshLayer:
     """Return a disc with the area of an opening, slightly outside it."""
     angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
     first = curves.any_perpendicular(opening.normal)
@@ -667,14 +647,14 @@ def _disc(number: int, opening: Opening) -> MeshLayer:
     points = np.concatenate([center[None], center + 0.5 * opening.diameter_mm * ring])
     around = np.arange(40)
     faces = np.stack([np.zeros(40, int), 1 + around, 1 + (around + 1) % 40], axis=1)
-    return MeshLayer(f"opening {number}", "", _opening_colour(opening), Surface(points, faces))
+    return scene.MeshLayer(f"opening {number}", "", _opening_colour(opening), Surface(points, faces))
 
 
-def _wires(name: str, found: Sketch | Deployment, colour: Colour, coverage: Callable[[], Floats]) -> LineLayer:
+def _wires(name: str, found: Sketch | Deployment, colour: Colour, coverage: Callable[[], Floats]) -> scene.LineLayer:
     """Return the wires of a device, colored by the values at the nearest nodes (rows, columns)."""
     stent, gap_mm = found.stent, found.wall_gap_mm
     if isinstance(stent, Coils):
-        return wires_of("wires", name, stent)
+        return scene.wires_of("wires", name, stent)
     of_node = gap_mm
     if colour == "coverage":
         of_node = 100 * coverage()
@@ -683,7 +663,7 @@ def _wires(name: str, found: Sketch | Deployment, colour: Colour, coverage: Call
     some = stent.wire_points_mm[::NEIGHBOURS]
     near = cKDTree(stent.nodes_mm.reshape(-1, 3)).query(some)[1]
     values = np.repeat(of_node.ravel()[near], NEIGHBOURS)[: len(stent.wire_points_mm)]
-    return wires_of("wires", name, stent, scale=colour, values=values)
+    return scene.wires_of("wires", name, stent, scale=colour, values=values)
 
 
 def _covered(stent: Stent) -> Floats:

@@ -15,7 +15,7 @@ from vstent.geometry.surface import Surface
 from vstent.kernels import topology, triangles
 from vstent.kernels.arrays import Floats, freeze
 from vstent.kernels.voxels import isosurface
-from vstent.reporting.packing import Packer, message
+from vstent.reporting.packing import LEVELS, Packer, message
 from vstent.reporting.scene import FRONTAL, MeshLayer, view_of
 from vstent.reporting.thinning import thin_surface
 
@@ -29,8 +29,6 @@ SAMPLE: Final = 3e5
 """Number of voxels, about, from which the quantiles of the intensity are computed."""
 STRAIGHT_DEG: Final = 0.5
 """Angle between the axes of a scan and those of the patient below which its slices count as anatomical."""
-_LEVELS: Final = 65_535
-"""Largest quantized intensity; it fits in two bytes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +73,9 @@ class Scan:
     def _step(self) -> float:
         """Difference of two neighbouring quantized intensities: 1 where whole numbers fit without loss."""
         low, high = self._ends
-        if self.image.voxels.dtype.kind in "iub" and high - low <= _LEVELS:
+        if self.image.voxels.dtype.kind in "iub" and high - low <= LEVELS:
             return 1.0
-        return (high - low) / _LEVELS or 1.0
+        return (high - low) / LEVELS or 1.0
 
     @cached_property
     def _quantiles(self) -> list[float]:

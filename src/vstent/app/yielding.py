@@ -13,10 +13,7 @@ from vstent.devices.stent import Stent
 from vstent.errors import InputError
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Anatomy
-from vstent.reporting.scene import LineLayer, MeshLayer, own_layers
-
-Layers = list[MeshLayer | LineLayer]
-"""Layers of a picture."""
+from vstent.reporting.scene import Layers, LineLayer, MeshLayer, own_layers
 
 
 class Yielding:

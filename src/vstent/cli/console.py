@@ -11,6 +11,7 @@ from rich.console import Console as RichConsole
 from rich.status import Status
 from rich.table import Column, Table
 
+from vstent.deployment.coverage import UNION
 from vstent.devices.design import Design
 from vstent.devices.fit import Fitted
 from vstent.devices.ranges import MARGIN
@@ -38,21 +39,10 @@ ROWS: Final = (
 )
 """Rows of the comparison of flows: title and key of the index."""
 CONTRAST_ROWS: Final = (
-    "contrast_preview_error_fraction",
-    "contrast_arrival_s",
-    "contrast_peak_s",
-    "contrast_peak_fraction",
-    "washout_half_life_s",
-    "contrast_retention_s",
-    "contrast_mean_transit_s",
-    "mean_sac_age_s",
-    "turnover_time_s",
-    "unexchanged_after_1s_volume_mm3",
-    "unexchanged_after_2s_volume_mm3",
-    "unexchanged_after_5s_volume_mm3",
-    "unexchanged_after_5s_area_mm2",
-    "fast_sac_volume_mm3",
-    "mean_sac_velocity_m_s",
+    *("contrast_preview_error_fraction", "contrast_arrival_s", "contrast_peak_s", "contrast_peak_fraction"),
+    *("washout_half_life_s", "contrast_retention_s", "contrast_mean_transit_s", "mean_sac_age_s", "turnover_time_s"),
+    *(f"unexchanged_after_{moment}s_volume_mm3" for moment in (1, 2, 5)),
+    *("unexchanged_after_5s_area_mm2", "fast_sac_volume_mm3", "mean_sac_velocity_m_s"),
 )
 """Keys of the table of angiograms."""
 DEVICE_ROWS: Final = (
@@ -70,8 +60,6 @@ DEVICE_ROWS: Final = (
 """Rows of the comparison of deployments: title and key of the measure."""
 
 
-NECK_UNION: Final = "neck_union_coverage_fraction"
-"""Key of the metal coverage of the neck by all devices of a treatment."""
 QUIET_S: Final = 30.0
 """Time between progress lines where the output is not a terminal, in s."""
 
@@ -145,9 +133,9 @@ def comparison_table(metrics: Mapping[str, Any]) -> Table:
         ]
         if any(cells):
             table.add_row(title, "", *cells)
-    unions = [treatment.get("together", {}).get(NECK_UNION) for treatment in treatments.values()]
+    unions = [treatment.get("together", {}).get(UNION) for treatment in treatments.values()]
     if any(len(treatment["implants"]) > 1 for treatment in treatments.values()) and any(unions):
-        table.add_row("Metal on the neck, all devices", "", *(_cell(NECK_UNION, union) for union in unions))
+        table.add_row("Metal on the neck, all devices", "", *(_cell(UNION, union) for union in unions))
     if bare:
         table.add_section()
         _add_flow_rows(table, metrics, {key: title for title, key in ROWS})

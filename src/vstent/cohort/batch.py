@@ -82,12 +82,7 @@ def left_to_do(cases: Sequence[Case], out: Path, *, keeps_files: bool = False) -
 def run_cohort(tasks: Sequence[Task], out: Path, workers: AbstractWorkers, progress: OnCase) -> None:
     """Run tasks of `left_to_do` in parallel; a case whose process died gets rows that state it.
 
-    Raises
-    ------
-    InputError
-        The processes or the cluster cannot be started.
-    VstentError
-        The connection to the cluster is lost; finished rows are kept.
+    Errors are those of the workers; finished rows are kept.
     """
     for done, (number, fault) in enumerate(workers.do(work, tasks), start=1):
         task = tasks[number]

@@ -5,16 +5,10 @@ from math import inf
 from typing import Final
 
 from vstent.anatomy.landing_zones import beside_neck, neck_points_mm, neck_span_mm
-from vstent.deployment.crumpling import crumpling, place_of_narrowest
+from vstent.deployment.crumpling import cells, place_of_narrowest
 from vstent.deployment.method import Course
-from vstent.deployment.sizing import (
-    APPOSED_GAP_MM,
-    LOOSE_FRACTION,
-    OVERSIZED_FRACTION,
-    oversizing_fraction,
-    reach_mm,
-    wanted_margin_mm,
-)
+from vstent.deployment.sizing import OVERSIZED_FRACTION, oversizing_fraction, reach_mm, wanted_margin_mm
+from vstent.deployment.wall import APPOSED_GAP_MM, LOOSE_FRACTION
 from vstent.devices.formulas import free_diameters_mm
 from vstent.devices.stent import Stent
 from vstent.geometry.vessel import Anatomy
@@ -48,12 +42,12 @@ def advise(anatomy: Anatomy, stent: Stent, course: Course, gap_mm: Floats, is_at
     else:
         largest_mm, remedy = gap_mm[is_at_patient].max(), _remedy(anatomy, stent, gap_mm, is_loose)
         lies += f", and {loose:.0%} of it is not apposed, with gaps up to {largest_mm:.2f} mm: {remedy}"
-    cells = crumpling(anatomy, stent)
-    if cells is not None and cells.crumpled_count:
-        count = f"{cells.crumpled_count} of its {cells.cells_count} cells"
-        width = f"{max(cells.narrowest_fraction, 0.0):.0%} of the width in a straight artery"
-        lies += f" {count} {'is' if cells.crumpled_count == 1 else 'are'} crumpled, the narrowest to {width}, "
-        lies += f"{place_of_narrowest(anatomy, cells)}. Move it along the artery."
+    found = cells(stent, anatomy.parent.axis)
+    if found.n_crumpled:
+        count = f"{found.n_crumpled} of its {len(found.width_fraction)} cells"
+        width = f"{max(found.width_fraction[found.narrowest], 0.0):.0%} of the width in a straight artery"
+        lies += f" {count} {'is' if found.n_crumpled == 1 else 'are'} crumpled, the narrowest to {width}, "
+        lies += f"{place_of_narrowest(anatomy, found)}. Move it along the artery."
     first_mm, last_mm = anatomy.parent.own_mm
     beyond_mm = {"proximal": first_mm - stent.proximal_abscissa_mm, "distal": stent.distal_abscissa_mm - last_mm}
     parts = [f"{length:.1f} mm at its {end} end" for end, length in beyond_mm.items() if length > SHORT_MM]

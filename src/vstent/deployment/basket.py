@@ -22,6 +22,7 @@ from vstent.anatomy.morphology import ON_NECK_MM, Measures
 from vstent.deployment import wires
 from vstent.deployment.contour import circles, evenly_spaced, normals, perimeters
 from vstent.deployment.coverage import coverage_fractions, pore_areas_mm2, pore_places, quad_areas_mm2, quad_middles_mm
+from vstent.deployment.wall import APPOSED_GAP_MM, LOOSE_FRACTION
 from vstent.devices.design import Basket, Size, piece_length_mm
 from vstent.devices.formulas import grid, meridian_mm, rows_along
 from vstent.devices.stent import Deployment, Landing, Stent
@@ -38,10 +39,6 @@ OUT_MM: Final = 0.5
 """Length, in mm, by which the end of the proposed size may lie below the middle of the neck."""
 BODY_FRACTION: Final = 0.9
 """Fraction of the largest radius above which a row belongs to the body of the basket, whose gaps are measured."""
-APPOSED_GAP_MM: Final = 0.1
-"""Gap, in mm, below which a node of the body is apposed."""
-LOOSE_FRACTION: Final = 0.05
-"""Fraction of the body that may have gaps without a note."""
 TOLD_MM: Final = 0.5
 """Smallest length, in mm, by which a basket stands out and that is reported."""
 NEAR_MM: Final = 0.3

@@ -28,7 +28,7 @@ from scipy.sparse.linalg import spsolve
 from vstent.deployment.contour import bilinear
 from vstent.deployment.crowns import Split, around_rings
 from vstent.kernels.arrays import Floats, Ints
-from vstent.kernels.net import Net
+from vstent.kernels.net import CALMING, Net
 
 Laid = Callable[[Floats, Floats, Floats], Floats]
 """Callable that puts points on the wall: points (n, 3) in mm, rows (n,) and columns (n,) of the chart in, (n, 3) out.
@@ -57,8 +57,6 @@ GAIN: Final = 0.002
 """Relative decrease of the cost below which the iteration stops."""
 INERTIA: Final = 0.03
 """Levenberg-Marquardt damping of the first step: squared weight of the moves."""
-CALMING: Final = 3.0
-"""Factor that divides the damping after a successful step. A failed step multiplies the damping by its square."""
 STUCK: Final = 1e3
 """Damping above which no further step is tried."""
 TINY_MM: Final = 0.02

@@ -47,7 +47,18 @@ class Cells(NamedTuple):
     """(k,) cosine of the angle to the inner side of the bend: 1 on the inner side, -1 on the outer side, 0 without a
     bend."""
 
+    @property
+    def narrowest(self) -> int:
+        """Number of the narrowest cell."""
+        return int(self.width_fraction.argmin())
 
+    @property
+    def n_crumpled(self) -> int:
+        """Number of crumpled cells."""
+        return int((self.width_fraction < CRUMPLED_FRACTION).sum())
+
+
+@lru_cache(maxsize=8)  # a deployment is advised on and measured
 def cells(stent: Stent, axis: Centerline) -> Cells:
     """Compute how wide the cells of a device are, seen from the axis of the artery; none where no cell is whole.
 
@@ -86,56 +97,27 @@ def cells(stent: Stent, axis: Centerline) -> Cells:
     return Cells(width_mm / straight_mm, abscissa_mm, np.where(is_bent, inward, 0.0))
 
 
-class Crumpling(NamedTuple):
-    """How strongly the cells of a device are crumpled, and where."""
-
-    narrowest_fraction: float
-    """Smallest width of a cell, relative to a straight artery; negative if it is turned over."""
-    abscissa_mm: float
-    """Arc length of the narrowest cell on the parent axis, in mm."""
-    inward: float
-    """Cosine of the angle from the narrowest cell to the inner side of the bend; 0 without a bend."""
-    crumpled_count: int
-    """Number of crumpled cells."""
-    cells_count: int
-    """Number of cells."""
-
-
-@lru_cache(maxsize=8)  # a deployment is advised on and measured
-def crumpling(anatomy: Anatomy, stent: Stent) -> Crumpling | None:
-    """Find the narrowest cell of a device, and count the crumpled ones."""
-    found = cells(stent, anatomy.parent.axis)
-    if not len(found.width_fraction):
-        return None
-    worst = int(found.width_fraction.argmin())
-    return Crumpling(
-        float(found.width_fraction[worst]),
-        float(found.abscissa_mm[worst]),
-        float(found.inward[worst]),
-        int((found.width_fraction < CRUMPLED_FRACTION).sum()),
-        len(found.width_fraction),
-    )
-
-
 def crumpling_measures(anatomy: Anatomy, stent: Stent) -> Measures:
     """Return the smallest width of a cell, its place, and the number and fraction of crumpled cells; empty if none."""
-    found = crumpling(anatomy, stent)
-    if found is None:
+    found = cells(stent, anatomy.parent.axis)
+    if not len(found.width_fraction):
         return {}
+    worst, inward = found.narrowest, found.inward[found.narrowest]
     measures: Measures = {
-        "min_cell_width_fraction": found.narrowest_fraction,
-        "narrowest_cell_abscissa_mm": found.abscissa_mm,
-        "crumpled_cells_count": float(found.crumpled_count),
-        "crumpled_cells_fraction": found.crumpled_count / found.cells_count,
+        "min_cell_width_fraction": float(found.width_fraction[worst]),
+        "narrowest_cell_abscissa_mm": float(found.abscissa_mm[worst]),
+        "crumpled_cells_count": float(found.n_crumpled),
+        "crumpled_cells_fraction": found.n_crumpled / len(found.width_fraction),
     }
-    if found.inward:
-        measures["narrowest_cell_angle_rad"] = float(np.arccos(np.clip(found.inward, -1.0, 1.0)))
+    if inward:
+        measures["narrowest_cell_angle_rad"] = float(np.arccos(np.clip(inward, -1.0, 1.0)))
     return measures
 
 
-def place_of_narrowest(anatomy: Anatomy, found: Crumpling) -> str:
+def place_of_narrowest(anatomy: Anatomy, found: Cells) -> str:
     """Say where the narrowest cell lies: its distance from the nearer end of the neck, and the side of the bend."""
-    side = f", on the {'inner' if found.inward > 0 else 'outer'} side of the bend"
-    if abs(found.inward) < BESIDE:
-        side = ", between the inner and the outer side of the bend" if found.inward else ""
-    return f"{beside_neck(anatomy, found.abscissa_mm)}{side}"
+    inward = found.inward[found.narrowest]
+    side = f", on the {'inner' if inward > 0 else 'outer'} side of the bend"
+    if abs(inward) < BESIDE:
+        side = ", between the inner and the outer side of the bend" if inward else ""
+    return f"{beside_neck(anatomy, float(found.abscissa_mm[found.narrowest]))}{side}"

@@ -13,7 +13,8 @@ from vstent.deployment.coils import measure_coils
 from vstent.deployment.coverage import UNION, density, quad_areas_mm2, together
 from vstent.deployment.crowns import free_crowns
 from vstent.deployment.crumpling import crumpling_measures
-from vstent.deployment.sizing import APPOSED_GAP_MM, oversizing_fraction
+from vstent.deployment.sizing import oversizing_fraction
+from vstent.deployment.wall import APPOSED_GAP_MM
 from vstent.devices.design import Basket, Coil, piece_length_mm
 from vstent.devices.formulas import grid
 from vstent.devices.stent import Coils, Deployment, Stent
@@ -28,10 +29,8 @@ def measure(anatomy: Anatomy, deployment: Deployment) -> Measures:
 
     Parameters
     ----------
-    anatomy : Anatomy
-        The artery; a device on another path is measured on that.
-    deployment : Deployment
-        The deployed device.
+    anatomy : the artery; a device on another path is measured on that.
+    deployment : the deployed device.
 
     Returns
     -------

@@ -19,6 +19,7 @@ from vstent.anatomy.landing_zones import landing_diameters_mm, neck_span_mm
 from vstent.deployment.basket import propose_basket
 from vstent.deployment.braid import expected_profile, march
 from vstent.deployment.sketch import measured_wall
+from vstent.deployment.wall import APPOSED_GAP_MM, LOOSE_FRACTION
 from vstent.devices.design import Basket, Design, Size
 from vstent.devices.formulas import mesh_nodes
 from vstent.devices.stent import Landing, Stent
@@ -35,10 +36,6 @@ It allows for the deployed length, which can only be estimated before deployment
 """
 DIAMETER_SLACK_MM: Final = 0.05
 """Amount, in mm, by which a label diameter may be below that of the landing zone and still count as not below it."""
-APPOSED_GAP_MM: Final = 0.1
-"""Gap between the outer face of the device and the wall, in mm, below which a node is apposed."""
-LOOSE_FRACTION: Final = 0.05
-"""Fraction of a device that may have gaps without a note and without a wider size being proposed."""
 OVERSIZED_FRACTION: Final = 0.8
 """Fraction by which the label diameter may exceed the artery's diameter without a note.
 

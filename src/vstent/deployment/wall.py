@@ -28,6 +28,10 @@ SEAM_MM: Final = 0.4
 """Length, in mm, by which a ramp goes on along the wall, which ends in whole triangles at the foot of the ramp."""
 ON_WALL_MM: Final = 1e-9
 """Distance, in mm, below which a point lies on the wall, so that the direction to its closest point is undefined."""
+APPOSED_GAP_MM: Final = 0.1
+"""Gap between the outer face of a device and the wall, in mm, below which a node is apposed."""
+LOOSE_FRACTION: Final = 0.05
+"""Fraction of a device, or of the body of a basket, that may have gaps without a note or another size proposed."""
 
 
 class Contact(NamedTuple):

@@ -122,6 +122,10 @@ class _Listed:
     ranges: tuple[Range, ...] = field(default=(), kw_only=True)
     """Range of every number."""
 
+    def covered(self, struts: Fraction, layer: Fraction) -> Fraction:
+        """Return the fraction under metal where struts, which meet without crossing, cover a fraction of the wall."""
+        return struts
+
 
 @dataclass(frozen=True, eq=False)
 class Braid(_Listed):
@@ -361,10 +365,6 @@ class LaserCut(_Listed):
         """Sum of the widths of all struts around the device, in um."""
         return self.n_columns * self.strut_width_um
 
-    def covered(self, struts: Fraction, layer: Fraction) -> Fraction:
-        """Return the fraction under metal: that of the struts, which meet without crossing."""
-        return struts
-
     @property
     def numbers(self) -> dict[str, float]:
         """Numbers of the struts by name, as in `Range.name`."""
@@ -410,10 +410,6 @@ class Coil(_Listed):
     def mesh_offset_um(self) -> float:
         """Distance from the outer face of the coil to its axis, in um."""
         return self.wall_offset_um
-
-    def covered(self, hand: Fraction, layer: Fraction) -> Fraction:
-        """Return the fraction under metal."""
-        return hand
 
     @property
     def numbers(self) -> dict[str, float]:

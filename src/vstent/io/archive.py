@@ -25,18 +25,8 @@ _ROOT: Final = "vstent."
 _KIND: Final = "is"
 """Key of the JSON text that states the kind of a value."""
 DAMAGE: Final = (
-    OSError,
-    ValueError,
-    KeyError,
-    TypeError,
-    AttributeError,
-    ImportError,
-    EOFError,
-    NotImplementedError,
-    RuntimeError,
-    MemoryError,
-    zipfile.BadZipFile,
-    zlib.error,
+    *(OSError, ValueError, KeyError, TypeError, AttributeError, ImportError, EOFError, NotImplementedError),
+    *(RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error),
 )
 """Exceptions that reading a damaged archive raises."""
 MOST_BYTES: Final = 1 << 33

@@ -30,7 +30,7 @@ IMAGE_SUFFIXES: Final = (
 )
 """Suffixes of scans."""
 CACHE: Final = ".vstent"
-"""Subfolder by which a folder of results is recognized; it holds the finished stages."""
+"""Subfolder by which a folder of results is recognized; it holds the store of finished stages, and the lock."""
 _VTK_IMAGE: Final = re.compile(rb"^\s*DATASET\s+(STRUCTURED_POINTS|RECTILINEAR_GRID)", re.I | re.M)
 """Line of a legacy VTK file that holds an image."""
 PARTIAL: Final = ".partial-"

@@ -199,13 +199,31 @@ def _add_block(matrix: Any, i: int, j: int, weight: float, d: Any) -> None:
 
 
 @njit(cache=True, error_model="numpy")
+def _dot(a: Any, b: Any) -> float:
+    """Return the inner product of two vectors (3,)."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True, error_model="numpy")
+def _row(rows: Any, i: int) -> tuple[float, float, float]:
+    """Return a row of an array (n, 3)."""
+    return rows[i, 0], rows[i, 1], rows[i, 2]
+
+
+@njit(cache=True, error_model="numpy")
+def _cross(a: Any, b: Any) -> tuple[float, float, float]:
+    """Return the cross product of two vectors (3,)."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@njit(cache=True, error_model="numpy")
 def _bend(rods: Any, laws: Any, first: int, n: int, force: Any, torque: Any, matrix: Any, turn: Any) -> float:
     """Add forces and stiffness of stretch, bending and twist from the node `first` on; return the energy.
 
     `turn` (n, 2) becomes the stiffness against turning the frames: its diagonal, and that to the next segment.
     """
     x, frame, length = rods.x, rods.frame, laws.segment
-    t0, t1 = np.zeros(3), np.zeros(3)
+    t0, t1, u, v = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
     l0, energy = 0.0, 0.0
     for j in range(max(first - 2, 0), n - 1):
         if not rods.is_segment[j]:
@@ -228,18 +246,11 @@ def _bend(rods: Any, laws: Any, first: int, n: int, force: Any, torque: Any, mat
         _add_block(matrix, j + 1, j + 1, stiff, t1)
         _add_block(matrix, j + 1, j, -stiff, t1)
         if l0 > 0.0:
-            cosine = t0[0] * t1[0] + t0[1] * t1[1] + t0[2] * t1[2]
-            open = max(1.0 + cosine, 1e-3)
-            k0 = 2 * (t0[1] * t1[2] - t0[2] * t1[1]) / open
-            k1 = 2 * (t0[2] * t1[0] - t0[0] * t1[2]) / open
-            k2 = 2 * (t0[0] * t1[1] - t0[1] * t1[0]) / open
-            ax, ay, az = frame[j - 1]
-            bx, by, bz = frame[j]
-            # The second axes of the material.
-            px, py, pz = t0[1] * az - t0[2] * ay, t0[2] * ax - t0[0] * az, t0[0] * ay - t0[1] * ax
-            qx, qy, qz = t1[1] * bz - t1[2] * by, t1[2] * bx - t1[0] * bz, t1[0] * by - t1[1] * bx
-            a0, a1 = ax * k0 + ay * k1 + az * k2, bx * k0 + by * k1 + bz * k2
-            b0, b1 = px * k0 + py * k1 + pz * k2, qx * k0 + qy * k1 + qz * k2
+            open = max(1.0 + _dot(t0, t1), 1e-3)
+            cross, a, b = _cross(t0, t1), _row(frame, j - 1), _row(frame, j)
+            k = 2 * cross[0] / open, 2 * cross[1] / open, 2 * cross[2] / open
+            p, q = _cross(t0, a), _cross(t1, b)  # the second axes of the material
+            a0, a1, b0, b1 = _dot(a, k), _dot(b, k), _dot(p, k), _dot(q, k)
             first, second = 0.5 * (b0 + b1), -0.5 * (a0 + a1)
             bend = np.sqrt(first * first + second * second)
             off0, off1 = first - rods.natural[j, 0], second - rods.natural[j, 1]
@@ -249,40 +260,28 @@ def _bend(rods: Any, laws: Any, first: int, n: int, force: Any, torque: Any, mat
                 more = HARDER * (bend - laws.sharpest) / (bend * length)
                 energy += 0.5 * HARDER * (bend - laws.sharpest) ** 2 / length
                 w0, w1, stiff = w0 + more * first, w1 + more * second, 1.0 + HARDER
-            along = (ax * t1[0] + ay * t1[1] + az * t1[2]) / open
-            ux, uy, uz = ax - along * (t0[0] + t1[0]), ay - along * (t0[1] + t1[1]), az - along * (t0[2] + t1[2])
-            angle = -np.arctan2(ux * qx + uy * qy + uz * qz, ux * bx + uy * by + uz * bz)
+            along = _dot(a, t1) / open
+            for c in range(3):
+                u[c] = a[c] - along * (t0[c] + t1[c])
+                v[c] = w0 * ((p[c] + q[c]) / open) - w1 * ((a[c] + b[c]) / open)
+            angle = -np.arctan2(_dot(u, q), _dot(u, b))
             moment = laws.twist * angle / length
             energy += 0.5 * moment * angle
             torque[j - 1] += 0.5 * (w0 * a0 + w1 * b0) + moment
             torque[j] += 0.5 * (w0 * a1 + w1 * b1) - moment
-            held = 0.5 * (k0 * k0 + k1 * k1 + k2 * k2) / length + laws.twist / length
+            held = 0.5 * _dot(k, k) / length + laws.twist / length
             turn[j - 1, 0] += held
             turn[j, 0] += held
             turn[j - 1, 1] = -laws.twist / length
-            sx, sy, sz = (ax + bx) / open, (ay + by) / open, (az + bz) / open
-            rx, ry, rz = (px + qx) / open, (py + qy) / open, (pz + qz) / open
-            size = w0 * first + w1 * second
-            vx, vy, vz = w0 * rx - w1 * sx, w0 * ry - w1 * sy, w0 * rz - w1 * sz
-            half = 0.5 * moment
-            m = size / open
-            g0x = (-m * (t0[0] + t1[0]) + (t1[1] * vz - t1[2] * vy) + half * k0) / l0
-            g0y = (-m * (t0[1] + t1[1]) + (t1[2] * vx - t1[0] * vz) + half * k1) / l0
-            g0z = (-m * (t0[2] + t1[2]) + (t1[0] * vy - t1[1] * vx) + half * k2) / l0
-            g1x = (-m * (t0[0] + t1[0]) - (t0[1] * vz - t0[2] * vy) + half * k0) / l1
-            g1y = (-m * (t0[1] + t1[1]) - (t0[2] * vx - t0[0] * vz) + half * k1) / l1
-            g1z = (-m * (t0[2] + t1[2]) - (t0[0] * vy - t0[1] * vx) + half * k2) / l1
-            force[j - 1, 0] += g0x
-            force[j - 1, 1] += g0y
-            force[j - 1, 2] += g0z
-            force[j, 0] += g1x - g0x
-            force[j, 1] += g1y - g0y
-            force[j, 2] += g1z - g0z
-            force[j + 1, 0] -= g1x
-            force[j + 1, 1] -= g1y
-            force[j + 1, 2] -= g1z
+            m, half = (w0 * first + w1 * second) / open, 0.5 * moment
             stiff /= length**3
+            across0, across1 = _cross(t1, v), _cross(t0, v)
             for c in range(3):
+                g0 = (-m * (t0[c] + t1[c]) + across0[c] + half * k[c]) / l0
+                g1 = (-m * (t0[c] + t1[c]) - across1[c] + half * k[c]) / l1
+                force[j - 1, c] += g0
+                force[j, c] += g1 - g0
+                force[j + 1, c] -= g1
                 matrix[3 * j - 3 + c, 0] += stiff
                 matrix[3 * j + c, 0] += 4 * stiff
                 matrix[3 * j + 3 + c, 0] += stiff

@@ -24,7 +24,7 @@ from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Floats
 from vstent.plan.bends import NECK, crowding, shortening
 from vstent.plan.reduced import Reduced
-from vstent.plan.shares import centered_points, first_order_shares
+from vstent.plan.shares import INTERVAL, centered_points, first_order_shares
 from vstent.plan.workers import spread
 
 LENGTH: Final = "deployed_length_mm"
@@ -36,8 +36,6 @@ SAMPLES: Final = 128
 FEW_SAMPLES: Final = 32
 """Number of samples for the band of the deployed length alone, and number of deployments for those of the gaps; a power
 of two."""
-INTERVAL: Final = (0.025, 0.975)
-"""Quantiles at the ends of a band: 95 % of the samples lie in it."""
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,8 @@ from scipy.special import fdtri
 
 from vstent.kernels.arrays import Floats
 
+INTERVAL: Final = (0.025, 0.975)
+"""Quantiles at the ends of a band or an interval: 95 % of the samples lie in it."""
 STORED: Final = Path(__file__).with_name("sobol.npy")
 """First 128 points of a Sobol sequence in 24 dimensions, in units of 1/128."""
 STEADY: Final = 1e-9

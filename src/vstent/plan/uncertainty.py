@@ -33,7 +33,7 @@ from vstent.flow.simulation import Checkpoint, simulate_case
 from vstent.geometry.vessel import Anatomy
 from vstent.kernels.arrays import Floats, freeze
 from vstent.plan.ranges import STIFFNESS, Ranges
-from vstent.plan.shares import centered_points, first_order_shares
+from vstent.plan.shares import INTERVAL, centered_points, first_order_shares
 from vstent.plan.widening import widened
 
 CAUSES: Final = ("threshold", "landing", "device", "inflow")
@@ -65,8 +65,6 @@ EFFECTS: Final = "straightened_bare_", "straightened_"
 """What the names of these begin with: without and with the device."""
 WIDEST_FRACTION: Final = 0.1
 """Fraction of the free diameter below which the range of the device's diameter must be."""
-INTERVAL: Final = (0.025, 0.975)
-"""Quantiles at the ends of an interval: 95 % of the samples lie in it."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,22 +15,14 @@ Row = Mapping[str, Any]
 """One case with one treatment: column name to value."""
 
 HEADLINES: Final = (
-    "vessel.sac_volume_mm3",
-    "vessel.neck_max_diameter_mm",
-    "vessel.parent_proximal_diameter_mm",
-    "implant.deployed_length_mm",
-    "implant.oversizing_fraction",
-    "implant.apposed_fraction",
-    "implant.max_wall_gap_mm",
-    "implant.neck_metal_coverage_fraction",
-    "implant.neck_pore_density_per_mm2",
+    *("vessel.sac_volume_mm3", "vessel.neck_max_diameter_mm", "vessel.parent_proximal_diameter_mm"),
+    *("implant.deployed_length_mm", "implant.oversizing_fraction"),
+    *("implant.apposed_fraction", "implant.max_wall_gap_mm"),
+    *("implant.neck_metal_coverage_fraction", "implant.neck_pore_density_per_mm2"),
     "implant.p95_wire_stretch_fraction",
-    "change.neck_inflow_mL_s_ratio",
-    "change.mean_sac_velocity_m_s_ratio",
-    "change.mean_sac_wss_Pa_ratio",
-    "change.turnover_time_s_ratio",
-    "case_s",
-    "peak_memory_MB",
+    *("change.neck_inflow_mL_s_ratio", "change.mean_sac_velocity_m_s_ratio"),
+    *("change.mean_sac_wss_Pa_ratio", "change.turnover_time_s_ratio"),
+    *("case_s", "peak_memory_MB"),
 )
 """Keys of the table columns that are drawn and searched for outliers; the end of each key is its unit."""
 UNDER_PICTURE: Final = ("implant.deployed_length_mm", "implant.neck_metal_coverage_fraction")

@@ -52,16 +52,8 @@ WANTED: Final = {
 """Sign of the wanted change of a flow metric. Less and slower inflow is associated with occlusion; for other metrics
 no direction is agreed on."""
 HEADLINES: Final = (
-    "neck_inflow_mL_s",
-    "neck_inflow_in_sac_mL_s",
-    "neck_inflow_in_artery_mL_s",
-    "mean_sac_velocity_m_s",
-    "turnover_time_s",
-    "mean_sac_wss_Pa",
-    "low_shear_area_fraction",
-    "contrast_preview_error_fraction",
-    "contrast_retention_s",
-    "contrast_mean_transit_s",
-    "mean_sac_age_s",
+    *("neck_inflow_mL_s", "neck_inflow_in_sac_mL_s", "neck_inflow_in_artery_mL_s"),
+    *("mean_sac_velocity_m_s", "turnover_time_s", "mean_sac_wss_Pa", "low_shear_area_fraction"),
+    *("contrast_preview_error_fraction", "contrast_retention_s", "contrast_mean_transit_s", "mean_sac_age_s"),
 )
 """Keys of the flow metrics on the first screen of the report, the most important first."""

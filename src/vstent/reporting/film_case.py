@@ -10,7 +10,7 @@ from vstent.angiography.filming import FilmSettings
 from vstent.angiography.working_projection import working_projection
 from vstent.devices.catalogue import find_design
 from vstent.devices.treatment import BARE
-from vstent.reporting.films import Density, shown_of, write_films
+from vstent.reporting.films import shown_of, write_films
 from vstent.reporting.write import write_report
 from vstent.study.contrast import FOLDER, angiograms, stents_of
 from vstent.study.folder import RUN, claimed
@@ -47,9 +47,8 @@ def film_case(
     aimed = film if film.angles_rad else replace(film, angles_rad=working_projection(anatomy))
     shown = shown_of(histories, stents, titles, aimed)
     curves = {titles[name]: one.curves for name, one in found.items()}
-    densities = [Density(title, one.time_s, one.sac_mg_mL, one.parent_mg_mL) for title, one in curves.items()]
     with claimed(out):
-        write_films(out / FOLDER, shown, densities, study=study)
+        write_films(out / FOLDER, shown, curves, study=study)
     view = shown[BARE].film.view
     told = f"{view.name}, {view.columns} x {view.rows} pixels of {view.pixel_mm:g} mm."
     progress(Progress("film", 1.0, told))

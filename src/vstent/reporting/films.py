@@ -4,11 +4,13 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vstent.angiography.curves import Curves
 from vstent.angiography.film import Film, film_of, levels_of, window_of, wire_shadow
 from vstent.angiography.filming import FilmSettings, projectors_of, view_for
 from vstent.angiography.history import History
@@ -17,7 +19,6 @@ from vstent.io.files import write_bytes
 from vstent.io.films import write_animation, write_frames
 from vstent.io.writers import write_json
 from vstent.io.xa_writer import BITS, XaHeader, write_xa
-from vstent.kernels.arrays import Floats
 from vstent.reporting.figures import Picture, image_of
 from vstent.reporting.lettering import blank, bytes_of, font, put_title
 from vstent.study.contrast import FOLDER
@@ -55,8 +56,8 @@ class Shown:
     """What it shows: Before, or the device."""
     film: Film
     """The film."""
-    wires: NDArray[np.float32] | None = None
-    """(rows, columns) absorption by the wires; None: not shown."""
+    wires: Sequence[NDArray[np.float32]] = ()
+    """(rows, columns) absorption by the wires of every device; empty: not shown."""
     vessel: NDArray[np.float32] | None = None
     """(rows, columns) path length within the lumen; None: not shown."""
 
@@ -78,8 +79,7 @@ def shown_of(
     rates = {"frame_rate_Hz": settings.frame_rate_Hz, "energy_keV": settings.energy_keV}
     for name, history in histories.items():
         film = film_of(history.frames(), projectors[name], **rates)
-        shadows = [wire_shadow(view, stent) for stent in stents.get(name, ()) if settings.has_wires]
-        wires = np.sum(np.stack(shadows), axis=0) if shadows else None
+        wires = [wire_shadow(view, stent) for stent in stents.get(name, ()) if settings.has_wires]
         vessel = projectors[name](np.ones(history.stored.shape[1])) if settings.has_vessel else None
         found[name] = Shown(titles[name], film, wires, vessel)
     return found
@@ -148,28 +148,14 @@ def key_frames(shown: Sequence[Shown], window: float) -> Picture:
     return Picture("key_frames", "Angiogram before and after", caption, np.asarray(picture))
 
 
-@dataclass(frozen=True, eq=False)
-class Density:
-    """Contrast over time in one flow."""
-
-    title: str
-    """Name of the flow in pictures."""
-    time_s: Floats
-    """(t,) time since the start of the injection."""
-    sac_mg_mL: Floats
-    """(t,) mean iodine concentration in the sac."""
-    parent_mg_mL: Floats
-    """(t,) mean iodine concentration in the parent artery proximal to the neck."""
-
-
-def density_picture(densities: Sequence[Density]) -> Picture:
-    """Return the picture of the contrast in sac and parent artery over time."""
+def density_picture(curves: Mapping[str, Curves]) -> Picture:
+    """Return the picture of the contrast in sac and parent artery over time, by the titles of the flows."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.2, 3.0), facecolor="white", layout="constrained")
     axes = figure.subplots()
-    for one, color in zip(densities, COLOURS, strict=False):
-        axes.plot(one.time_s, one.sac_mg_mL, color=color, linewidth=1.6, label=f"{one.title}, sac")
+    for (title, one), color in zip(curves.items(), COLOURS, strict=False):
+        axes.plot(one.time_s, one.sac_mg_mL, color=color, linewidth=1.6, label=f"{title}, sac")
         axes.plot(one.time_s, one.parent_mg_mL, color=color, linewidth=0.9, linestyle=":", label="parent artery")
     axes.set_xlabel("time since the start of the injection [s]", fontsize=8)
     axes.set_ylabel("iodine [mg/mL]", fontsize=8)
@@ -186,11 +172,14 @@ def density_picture(densities: Sequence[Density]) -> Picture:
 def write_films(
     out: Path,
     shown: Mapping[str, Shown],
-    densities: Sequence[Density] = (),
+    curves: Mapping[str, Curves] = MappingProxyType({}),
     *,
     study: Mapping[str, Any] | None = None,
 ) -> list[str]:
-    """Write films into a folder: PNG frames and a DICOM file of each, and one animation of all side by side."""
+    """Write films into a folder: PNG frames and a DICOM file of each, and one animation of all side by side.
+
+    The curves, by the titles of the flows, give a picture of contrast over time.
+    """
     films = list(shown.values())
     window = window_of([one.film for one in films])
     written = []
@@ -201,7 +190,7 @@ def write_films(
         write_xa(out / f"{name}.dcm", stored, header_of(one, window, number, dict(study or {})))
         written += [name, f"{name}.dcm"]
     write_animation(out / ANIMATION, beside(films, window), 1.0 / films[0].film.frame_rate_Hz)
-    pictures = [key_frames(films, window), *([density_picture(densities)] if densities else [])]
+    pictures = [key_frames(films, window), *([density_picture(curves)] if curves else [])]
     for picture in pictures:
         write_bytes(out / f"{picture.id}.png", picture.png)
     told = [{"id": one.id, "title": one.title, "caption": one.caption} for one in pictures]

@@ -18,7 +18,7 @@ import numpy as np
 from vstent.kernels.arrays import Floats
 from vstent.reporting.scene import LineLayer, MeshLayer, Scale, Scene, View
 
-_LEVELS = 65_535
+LEVELS = 65_535
 """Largest quantized integer; it fits in two bytes."""
 
 
@@ -41,7 +41,7 @@ class Packer:
 
     def add_indices(self, indices: Any) -> dict[str, Any]:
         """Append indices as 2-byte integers, or as 4-byte integers where they are larger; return their block."""
-        wide = np.max(indices, initial=0) > _LEVELS
+        wide = np.max(indices, initial=0) > LEVELS
         return self.add(np.asarray(indices).ravel().astype(np.uint32 if wide else np.uint16))
 
     def add_numbers(self, numbers: Floats) -> dict[str, Any]:
@@ -50,7 +50,7 @@ class Packer:
         low, high = columns.min(axis=0, initial=np.inf), columns.max(axis=0, initial=-np.inf)
         if not len(columns):
             low = high = np.zeros(columns.shape[1])
-        step = (high - low) / _LEVELS
+        step = (high - low) / LEVELS
         levels = np.rint((columns - low) / np.where(step > 0, step, 1.0))
         return {**self.add(levels.astype(np.uint16)), "low": low.tolist(), "step": step.tolist()}
 

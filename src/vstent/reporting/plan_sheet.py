@@ -26,6 +26,29 @@ PICTURE_SHARE: Final = 0.19
 """Largest height of the picture as a fraction of the page."""
 MOST_NOTES: Final = 2
 """Largest number of notes on a page; the report has all."""
+OF_COILS: Final = {
+    "packing_density_fraction": "Packing density",
+    "coil_length_mm": "Length of all coils",
+    "coil_beyond_neck_mm": "Length beyond the plane of the neck",
+    "neck_covered_by_coils_fraction": "Part of the neck that they cover",
+}
+OF_BASKET: Final = {
+    "basket_width_mm": "Width in the sac",
+    "basket_height_mm": "Height in the sac",
+    "protrusion_mm": "Length that stands out into the artery",
+    "neck_uncovered_fraction": "Part of the neck that it leaves open",
+    "neck_metal_coverage_fraction": "Metal coverage over the neck",
+    "apposed_fraction": "Apposed",
+}
+OF_STENT: Final = {
+    "neck_to_proximal_end_mm": "Length beyond the neck, proximal",
+    "neck_to_distal_end_mm": "Length beyond the neck, distal",
+    "neck_metal_coverage_fraction": "Metal coverage over the neck",
+    "apposed_fraction": "Apposed",
+    "max_wall_gap_mm": "Largest gap to the wall",
+    "jailed_branches_count": "Jailed branches",
+}
+"""Keys and words of the metrics of coils, a basket or a stent on its page."""
 
 
 class Planned(NamedTuple):
@@ -120,44 +143,23 @@ def _vessel_rows(anatomy: Anatomy) -> list[tuple[str, str]]:
 def _device_rows(anatomy: Anatomy, deployment: Deployment, metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the table of device, landing zones and fit, with bands where there are any."""
     stent = deployment.stent
+    label = f"{stent.design.name} {stent.size.label}"
     if isinstance(stent, Coils):
-        keys = {
-            "packing_density_fraction": "Packing density",
-            "coil_length_mm": "Length of all coils",
-            "coil_beyond_neck_mm": "Length beyond the plane of the neck",
-            "neck_covered_by_coils_fraction": "Part of the neck that they cover",
-        }
-        cells = [(words, format_value(key, metrics[key])) for key, words in keys.items()]
         sizes = [(f"Coil {n}, loops × length", one.coil_label) for n, one in enumerate(stent.coils, start=1)]
-        return [("Coils", stent.design.name), *cells, *sizes]
+        return [("Coils", stent.design.name), *_measured(OF_COILS, metrics), *sizes]
     if isinstance(stent.design, Basket):
-        keys = {
-            "basket_width_mm": "Width in the sac",
-            "basket_height_mm": "Height in the sac",
-            "protrusion_mm": "Length that stands out into the artery",
-            "neck_uncovered_fraction": "Part of the neck that it leaves open",
-            "neck_metal_coverage_fraction": "Metal coverage over the neck",
-            "apposed_fraction": "Apposed",
-        }
-        cells = [(words, format_value(key, metrics[key])) for key, words in keys.items() if key in metrics]
-        return [("Device and label size, width x height", f"{stent.design.name} {stent.size.label}"), *cells]
-    rows = [
-        ("Device and label size", f"{stent.design.name} {stent.size.label}"),
-        ("Deployed length", f"{stent.deployed_length_mm:.1f} mm {ends(metrics, 'deployed_length_mm')}".rstrip()),
-    ]
-    anatomy = on_path(anatomy, stent.path)
-    for end, diameters_mm in zip(("Proximal", "Distal"), zone_diameters_mm(anatomy), strict=True):
+        return [("Device and label size, width x height", label), *_measured(OF_BASKET, metrics)]
+    length = f"{stent.deployed_length_mm:.1f} mm {ends(metrics, 'deployed_length_mm')}".rstrip()
+    rows = [("Device and label size", label), ("Deployed length", length)]
+    for end, diameters_mm in zip(("Proximal", "Distal"), zone_diameters_mm(on_path(anatomy, stent.path)), strict=True):
         words = f"{diameters_mm.min():.2f} to {diameters_mm.max():.2f} mm"
         rows.append((f"{end} landing zone, {ZONE_MM:g} mm: smallest and largest diameter", words))
-    keys = {
-        "neck_to_proximal_end_mm": "Length beyond the neck, proximal",
-        "neck_to_distal_end_mm": "Length beyond the neck, distal",
-        "neck_metal_coverage_fraction": "Metal coverage over the neck",
-        "apposed_fraction": "Apposed",
-        "max_wall_gap_mm": "Largest gap to the wall",
-        "jailed_branches_count": "Jailed branches",
-    }
-    return rows + [
+    return rows + _measured(OF_STENT, metrics)
+
+
+def _measured(keys: Mapping[str, str], metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return words and value of the metrics that there are, with bands where these have any."""
+    return [
         (words, f"{format_value(key, metrics[key])} {ends(metrics, key)}".rstrip())
         for key, words in keys.items()
         if key in metrics

@@ -111,6 +111,10 @@ class LineLayer(Layer):
         return self.points_mm
 
 
+Layers = list[MeshLayer | LineLayer]
+"""Layers of a picture."""
+
+
 @dataclass(frozen=True, eq=False)
 class View:
     """A direction of view."""
@@ -203,7 +207,7 @@ def scene_of(
     )
 
 
-def own_layers(pane: str, anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
+def own_layers(pane: str, anatomy: Anatomy) -> Layers:
     """Return the layers of an artery that has yielded to a treatment, which replace those as scanned in a pane."""
     return [replace(one, pane=pane) for one in anatomy_layers(anatomy) if one.id in OWN]
 
@@ -261,14 +265,14 @@ RING_MM = 1.0
 """Distance between the rings that show a continued artery, in mm."""
 
 
-def anatomy_layers(anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
+def anatomy_layers(anatomy: Anatomy) -> Layers:
     """Return the layers of lumen, landing surface, centerlines, axis, sacs and necks."""
     parent, own = anatomy.parent, anatomy.parent.landing_surface
     is_longer = any(parent.continued_mm)
     if is_longer:
         own = Surface(*triangles.compact(own.vertices_mm, own.faces[~parent.is_continued[own.faces].any(axis=1)]))
     centerlines = [line.points_mm for line in anatomy.vessel.centerlines]
-    layers: list[MeshLayer | LineLayer] = [
+    layers: Layers = [
         MeshLayer("lumen", "", WALL_COLOUR, thin_surface(anatomy.vessel.lumen, 40_000)[0], 0.16),
         MeshLayer("landing", "", (0.80, 0.74, 0.66), thin_surface(own, 24_000)[0]),
         curves_layer("centerlines", centerlines, 0.05, ASSUMED_COLOUR),
@@ -328,12 +332,10 @@ def node_coverage(stent: Stent) -> Floats:
     return np.concatenate([smooth, smooth[-1:]])
 
 
-def flow_layers(name: str, flow: FlowField, anatomy: Anatomy) -> list[MeshLayer | LineLayer]:
+def flow_layers(name: str, flow: FlowField, anatomy: Anatomy) -> Layers:
     """Return the wall and the sac's wall, each colored by shear stress on a scale of its own, and the streamlines."""
     wall, origin = thin_surface(flow.wall, 40_000)
-    layers: list[MeshLayer | LineLayer] = [
-        MeshLayer("shear", name, WALL_COLOUR, wall, scale="shear", values=flow.shear_Pa[origin])
-    ]
+    layers: Layers = [MeshLayer("shear", name, WALL_COLOUR, wall, scale="shear", values=flow.shear_Pa[origin])]
     seeds = [inlet_seeds_mm(flow, anatomy.vessel, N_INLET)]
     for aneurysm in anatomy.aneurysms[:1]:
         is_sac = on_sac(flow.wall, aneurysm.sac, aneurysm.neck)

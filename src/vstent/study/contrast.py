@@ -38,16 +38,9 @@ def angiograms(
 ) -> tuple[dict[str, Angiogram], dict[str, History]]:
     """Return angiogram and contrast of every flow of a case folder, ``bare`` first, and write curves and metrics.
 
-    Those that are stored for the same flow and settings are not computed again.
-
-    Raises
-    ------
-    ReadError
-        The folder holds no finished run of this version.
-    InputError
-        The run has no flow, or the window is too short for contrast to reach the sac.
-    FlowError
-        A flow does not fit in the free memory.
+    Those that are stored for the same flow and settings are not computed again. ReadError is raised where the folder
+    holds no finished run of this version, InputError where the run has no flow or the window is too short for contrast
+    to reach the sac, and FlowError where a flow does not fit in the free memory.
     """
     source, study = finished_run(out)
     with claimed(out):
@@ -151,10 +144,7 @@ def stored_measures(out: Path, keys: Mapping[str, Key]) -> dict[str, dict[str, f
 def stents_of(out: Path, names: Iterable[str]) -> tuple[Anatomy, dict[str, list[Stent]]]:
     """Return the anatomy of a finished case folder, and the implants of the named treatments as its run deployed them.
 
-    Raises
-    ------
-    ReadError
-        The folder holds no finished run of this version.
+    ReadError is raised where the folder holds no finished run of this version.
     """
     source, study = finished_run(out)
     store, keys = Store(out / CACHE), study_keys(source, study)

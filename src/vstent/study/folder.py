@@ -9,11 +9,9 @@ from pathlib import Path
 from typing import IO, Final
 
 from vstent.errors import FolderError, ReadError
-from vstent.io.files import sweep
+from vstent.io.files import CACHE as CACHE, sweep
 from vstent.study.store import UNREADABLE
 
-CACHE: Final = ".vstent"
-"""Subfolder of the case folder with the store and the lock."""
 RUN: Final = "run.json"
 """File of the case folder with the provenance of the run."""
 INPUT: Final = "input.json"
@@ -57,14 +55,8 @@ def claimed(out: Path) -> Iterator[None]:
     """Reserve a case folder for this process.
 
     Files that a killed process left half-written there are removed. Folders created here are removed at the end if they
-    are empty.
-
-    Raises
-    ------
-    FolderError
-        Another process uses the folder, or it cannot be written.
-    ReadError
-        It is a case folder of an older version.
+    are empty. FolderError is raised where another process uses the folder or it cannot be written, and ReadError where
+    it is a case folder of an older version.
     """
     refuse_older(out)
     cache = out / CACHE

@@ -88,14 +88,8 @@ def compute_missing(
     is finished when it begins, as in `rank_flows`; the one without a device is computed here. `progress` gets the
     number of finished flows, the number of all, and the name of the last.
 
-    Raises
-    ------
-    InputError
-        The processes or the cluster cannot be started.
-    FlowError
-        The flow without a device cannot be computed.
-    VstentError
-        The connection to the cluster is lost; finished flows are kept.
+    FlowError is raised where the flow without a device cannot be computed. Other errors are those of the workers;
+    finished flows are kept.
     """
     wanted = tuple(one for one in chosen if not is_finished(stored.get(one), has_contrast))
     if not wanted:

@@ -83,12 +83,8 @@ class Record:
 def read_record(path: Path, moved_to: Path | None = None) -> Record:
     """Read the ``run.json`` of a case folder and find its input, at the recorded path or where it has been moved to.
 
-    Raises
-    ------
-    ReadError
-        The file does not exist or is from another version, or the input is missing.
-    InputError
-        The input is not the recorded one.
+    ReadError is raised where the file does not exist or is from another version, or the input is missing, and
+    InputError where the input is not the recorded one.
     """
     try:
         told, settings = told_in(existing(path))
@@ -140,10 +136,7 @@ def told_in(run: Path) -> tuple[dict[str, Any], Settings]:
 def finished_run(out: Path) -> tuple[str, Settings]:
     """Return the SHA-256 of the input and the settings of the run of a case folder.
 
-    Raises
-    ------
-    ReadError
-        The folder holds no finished run of this version.
+    ReadError is raised where the folder holds no finished run of this version.
     """
     if not (out / RUN).is_file():
         raise ReadError(f"{out} is not a case folder with a finished run: run `vstent run` with this --out first")
@@ -243,12 +236,8 @@ def merged(out: Path, settings: Settings) -> Settings:
     """Return the settings of a run merged with those of the folder's last run of the same input (`refuse_other`).
 
     Earlier treatments come first and keep their sizes, places and flows; new ones are added. Where a run requests no
-    flow, new treatments get none and existing flows are kept.
-
-    Raises
-    ------
-    InputError
-        The folder holds results of settings that the new ones would invalidate.
+    flow, new treatments get none and existing flows are kept. InputError is raised where the folder holds results of
+    settings that the new ones would invalidate.
     """
     former = former_settings(out)
     if former is None:

@@ -162,10 +162,7 @@ def in_section(name: str) -> dict[str, Option]:
 def settings_of(given: Mapping[str, Any]) -> Settings:
     """Return the settings that options state, from values by name as `Option.value` returns them; None: not given.
 
-    Raises
-    ------
-    InputError
-        A file cannot be read, or an option is given without the one that it belongs to.
+    InputError is raised where a file cannot be read, or an option is given without the one that it belongs to.
     """
     given = {name: value for name, value in given.items() if value is not None}
     if {"flow-rate", "inlet-speed"} <= given.keys():

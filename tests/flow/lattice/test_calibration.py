@@ -195,6 +195,14 @@ def test_a_flow_without_a_screen_says_nothing_of_calibrating_it(braided: FlowCas
     assert "calibrated" not in simulate_case(with_numerics(bare, wires="calibrated")).advice
 
 
+def test_a_tile_lies_in_the_middle_of_a_narrow_neck_where_most_blood_passes(braided: FlowCase) -> None:
+    case = with_numerics(braided, cells_per_diameter=8.0, cells_across_neck=0.0, max_steps=100)
+    center_mm = calibration.strongest_mm(case, simulate_case(case))
+    assert case.ostium is not None
+    depth_mm = -case.vessel.closed.signed_distance(np.stack([center_mm, *case.ostium.vertices_mm]))
+    assert depth_mm[0] > 0.85 * depth_mm.max()
+
+
 def test_a_screen_whose_resistance_cannot_be_read_off_stays(braided: FlowCase, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a tile that diverged, force and velocity are nan."""
     case = with_numerics(braided, cells_per_diameter=8.0, cells_across_neck=0.0, max_steps=100)

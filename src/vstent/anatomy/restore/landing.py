@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from vstent.anatomy.restore.axis import STEP_MM, Tube, section_directions, section_rays
 from vstent.devices.stent import tube_faces
 from vstent.geometry.surface import Surface
-from vstent.geometry.vessel import Centerline, Vessel
+from vstent.geometry.vessel import Centerline
 from vstent.kernels import curves
 from vstent.kernels.arrays import Bools, Floats, Ints, freeze
 
@@ -62,11 +62,6 @@ class Landing:
         """Landing surface as an open tube, one ring of vertices per axis point."""
         rings = self.points_mm[:, None] + self.rho_mm[..., None] * section_directions(self.points_mm, self.n_rays)
         return Surface(rings.reshape(-1, 3), tube_faces(*self.rho_mm.shape))
-
-    @cached_property
-    def solid(self) -> Surface:
-        """Landing surface closed at both ends."""
-        return Vessel(self.surface).closed
 
     @property
     def n_rays(self) -> int:

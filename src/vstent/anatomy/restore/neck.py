@@ -87,11 +87,11 @@ class Artery(NamedTuple):
     def height_mm(self, points_mm: Floats, normals: Floats | None = None) -> Floats:
         """Return the height (n,) of points (n, 3) above the walls of all arteries, in mm; negative inside."""
         # With the lumen's normals, wall that faces a branch counts as higher: it belongs to a sac beside that branch.
-        first = self.landings[0].solid.signed_distance(points_mm)
+        first = self.landings[0].surface.closed.signed_distance(points_mm)
         height = np.minimum(first, self.above_branches_mm(points_mm, normals))
         for side in self.landings[1:]:
             away = 0.0 if normals is None else _turned_mm(side.points_mm, side.section_radius_mm, points_mm, normals)
-            height = np.minimum(height, side.solid.signed_distance(points_mm) + away)
+            height = np.minimum(height, side.surface.closed.signed_distance(points_mm) + away)
         return height
 
     def above_branches_mm(self, points_mm: Floats, normals: Floats | None = None) -> Floats:
@@ -108,7 +108,7 @@ class Artery(NamedTuple):
     def onto(self, points_mm: Floats) -> Floats:
         """Move points (n, 3), in mm, onto the wall of the artery nearest to them; points at a branch stay."""
         for _ in range(len(self.landings)):
-            above = np.stack([landing.solid.signed_distance(points_mm) for landing in self.landings])
+            above = np.stack([landing.surface.closed.signed_distance(points_mm) for landing in self.landings])
             nearest = above.argmin(axis=0)
             moved = points_mm.copy()
             for k, landing in enumerate(self.landings):
@@ -126,7 +126,7 @@ def apart_mm(landings: Sequence[Landing], branches: Tubes, along_mm: Floats, low
     if not len(branches.radius_mm):
         return np.zeros(0)
     radius = branches.radius_mm
-    gap_mm = np.min([one.solid.signed_distance(branches.centers_mm) for one in landings], axis=0) - radius
+    gap_mm = np.min([one.surface.closed.signed_distance(branches.centers_mm) for one in landings], axis=0) - radius
     share = np.clip(gap_mm / low_mm, 0.0, 1.0) * np.clip(ROOT - along_mm / radius, 0.0, 1.0)
     return np.asarray(np.maximum(low_mm - MOUTH * radius, 0.0) * share)
 

@@ -87,7 +87,7 @@ def is_beside_branch(landing: Landing, side_lines: Sequence[Centerline], bulge: 
     """Return whether a branch leaves the parent artery under a bulge or beside it."""
     foot = cKDTree(bulge.foot_mm)
     for line in side_lines:
-        is_apart = landing.solid.signed_distance(line.points_mm) > -0.5 * line.inscribed_radius_mm
+        is_apart = landing.surface.closed.signed_distance(line.points_mm) > -0.5 * line.inscribed_radius_mm
         if (is_apart & (foot.query(line.points_mm)[0] < PASSING * line.inscribed_radius_mm)).any():
             return True
     return False
@@ -182,7 +182,7 @@ def _artery(vessel: Vessel, landing: Landing, lines: Sequence[Centerline], bulge
     landings, proper = [landing], []
     foot = cKDTree(bulge.foot_mm)
     for line in lines:
-        depth = np.min([one.solid.signed_distance(line.points_mm) for one in landings], axis=0)
+        depth = np.min([one.surface.closed.signed_distance(line.points_mm) for one in landings], axis=0)
         is_apart = depth > -0.5 * line.inscribed_radius_mm
         in_sac = bulge.distances_mm(line.points_mm) < 1.2 * line.inscribed_radius_mm
         inner = np.flatnonzero(~is_apart | in_sac)
@@ -211,7 +211,7 @@ def _beside(lumen: Surface, landing: Landing, line: Centerline, bulge: Bulge) ->
     side = close_landing(lumen, fit_axis(lumen, course, [Mouth(bulge.foot_mm, bulge.inward)]))
     is_own = (~side.is_restored).mean(axis=1) > OWN_WALL
     is_own &= bulge.distances_mm(side.points_mm) > 1.2 * side.section_radius_mm
-    lost = np.flatnonzero(~is_own & (landing.solid.signed_distance(side.points_mm) > 0))
+    lost = np.flatnonzero(~is_own & (landing.surface.closed.signed_distance(side.points_mm) > 0))
     end = lost[0] if len(lost) else len(side.points_mm)
     if end < FEWEST_SECTIONS:
         return None
@@ -220,7 +220,7 @@ def _beside(lumen: Surface, landing: Landing, line: Centerline, bulge: Bulge) ->
 
 def _into_parent(landing: Landing, line: Centerline, bulge: Bulge) -> Centerline | None:
     """Return the path from a branch into the parent artery, towards the sac if possible; None if there is none."""
-    depth = landing.solid.signed_distance(line.points_mm)
+    depth = landing.surface.closed.signed_distance(line.points_mm)
     inside = np.flatnonzero(depth < -0.5 * line.inscribed_radius_mm)
     if not len(inside):
         return None

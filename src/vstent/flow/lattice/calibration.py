@@ -35,6 +35,8 @@ ROUNDS: Final = 2
 """Number of times that flow and resistance are computed in turn."""
 TILE_MM: Final = 1.3
 """Radius of the piece of the device whose wires are walls."""
+INNER_PART: Final = 0.9
+"""Least distance of its middle from the wall, over its radius or, in a narrow neck, over the largest that there is."""
 REACH_MM: Final = 0.6
 """Radius of the averages, and width of the rim of the tile that is not read: wires there border on the screen."""
 WIDEST_PORES_MM: Final = 0.4
@@ -67,11 +69,16 @@ def tile(case: FlowCase, center_mm: Floats) -> FlowCase:
 
 
 def strongest_mm(case: FlowCase, flow: FlowField) -> Floats:
-    """Return the middle (3,) of the tile through which most blood passes in a flow, in the mean square."""
+    """Return the middle (3,) of the tile through which most blood passes in a flow, in the mean square.
+
+    It keeps away from the rim of the neck, where averages span wires beside it (see `INNER_PART`).
+    """
     points_mm, normals, area_mm2 = _samples(case)
     through_m_s = np.einsum("pd,pd->p", sampling.values_at(flow, points_mm)[0], normals)
     strength = nearby.sums(points_mm, points_mm, (area_mm2 * through_m_s**2)[:, None], TILE_MM)
-    return np.asarray(points_mm[strength[:, 0].argmax()])
+    depth_mm = -case.vessel.closed.signed_distance(points_mm)
+    is_inner = depth_mm >= INNER_PART * min(TILE_MM, depth_mm.max())
+    return np.asarray(points_mm[np.where(is_inner, strength[:, 0], 0.0).argmax()])
 
 
 def read_off(
