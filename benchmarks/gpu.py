@@ -104,7 +104,7 @@ class Found:
 TINY = Extent(
     (0.4,),
     1,
-    Pairs.CORRECTED,
+    Pairs.LAST,
     1.0,
     1,
     1 << 7,
@@ -164,7 +164,7 @@ def state_of(case: FlowCase, spacing_mm: float, *, on_gpu: bool) -> State:
 def kernel_times(state: State, rounds: int, pairs: Pairs) -> dict[str, tuple[int, float, float]]:
     """Launches per round, and mean times in us on the GPU and on the host, of every kernel, launched one by one."""
     device = state.device
-    launches = [one for _ in range(rounds) for one in device.launches(pairs) if one[0].threads]
+    launches = [one for _ in range(rounds) for one in device.launches(pairs, 0) if one[0].threads]
     clock, found = Clock(device.stream), {}
     device.stream.synchronize()
     for launch, further in launches:

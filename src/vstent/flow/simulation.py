@@ -139,17 +139,18 @@ def _with_wires(case: FlowCase, wires: Wires) -> FlowCase:
 def _decided(case: FlowCase) -> tuple[FlowCase, str]:
     """Return a case with its wires as walls or as a screen where that is open, and a sentence with the reason."""
     from vstent.flow.lattice import calibration
-    from vstent.flow.lattice.cost import estimate
+    from vstent.flow.lattice.cost import estimate, fits
 
     are_coils = any(isinstance(one, Coils) for one in case.solids)  # their indices are those of a porous region
     if case.numerics.wires != "auto" or case.numerics.engine != LATTICE or case.wires is None or are_coils:
         return (_with_wires(case, "screen") if case.numerics.wires == "auto" else case), ""
-    cost, screen = estimate(_with_wires(case, "resolved")), _with_wires(case, "screen")
-    how = f"resolving them would take about {duration(USUAL_PART * cost.seconds)} and {cost.memory_bytes / 1e9:.2g} GB."
     if case.numerics.device_gpu:
-        return screen, f" The wires are a screen: {how}"
-    if USUAL_PART * cost.seconds < QUICK_S and cost.memory_bytes < free_memory_bytes():
-        return _with_wires(case, "resolved"), ""
+        require_gpu()
+    resolved, screen = _with_wires(case, "resolved"), _with_wires(case, "screen")
+    cost = estimate(resolved)
+    how = f"resolving them would take about {duration(USUAL_PART * cost.seconds)} and {cost.memory_bytes / 1e9:.2g} GB."
+    if USUAL_PART * cost.seconds < QUICK_S and fits(resolved):
+        return resolved, ""
     if calibration.suits(case):
         of_tiles_s, of_tile_bytes = calibration.cost(case)
         seconds = of_tiles_s + calibration.ROUNDS * USUAL_PART * estimate(screen).seconds
@@ -221,11 +222,6 @@ def engine_class(numerics: Numerics, *, is_pulsatile: bool) -> type[AbstractEngi
         raise InputError(
             f"the engine {numerics.engine} does not support a finer grid in a part of the vessel: leave out --refine, "
             f"or choose the engine {LATTICE}"
-        )
-    if (numerics.refine or numerics.wires in ("calibrated", "resolved")) and numerics.device_gpu:
-        raise InputError(
-            "finer grids in a part of the vessel are not computed on a GPU: leave out --refine and --wires, or "
-            "compute on the CPU (without --gpu)"
         )
     if numerics.device_gpu and not engine.runs_on_gpu:
         raise InputError(

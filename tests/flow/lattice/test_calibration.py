@@ -12,7 +12,7 @@ from vstent.flow import simulation
 from vstent.flow.case import PHASES, FlowCase, FlowField
 from vstent.flow.domain import default_cell_size_mm
 from vstent.flow.indices import indices, neck_diameter_mm
-from vstent.flow.lattice import calibration, stepping
+from vstent.flow.lattice import calibration, cost, stepping
 from vstent.flow.lattice.cost import estimate
 from vstent.flow.lattice.engine import LatticeBoltzmann, PulsatileLatticeBoltzmann
 from vstent.flow.lattice.levels import sizes_mm
@@ -114,6 +114,17 @@ def test_wires_too_many_for_walls_are_calibrated_where_that_is_quick(
     assert simulation._decided(is_open)[0].numerics.wires == "screen"
 
 
+@pytest.mark.parametrize(("free_bytes", "chosen"), [(1e12, "resolved"), (1e6, "calibrated")])
+def test_a_gpu_resolves_wires_where_that_is_quick_and_fits_in_its_memory(
+    free_bytes: float, chosen: str, braided: FlowCase, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(simulation, "require_gpu", lambda: None)
+    monkeypatch.setattr(cost, "block_rate", lambda *, on_gpu: 1e12 if on_gpu else 1.0)
+    monkeypatch.setattr(cost, "free_gpu_bytes", lambda: free_bytes)
+    is_open = with_numerics(braided, cell_size_mm=CELL_MM, wires="auto", device_gpu=True)
+    assert simulation._decided(is_open)[0].numerics.wires == chosen
+
+
 def test_a_narrow_neck_with_a_screen_has_a_finer_level_unless_the_spacing_is_given(braided: FlowCase) -> None:
     """A flow without a device has none, and a screen with few cells across the neck says so."""
     assert braided.ostium is not None
@@ -123,7 +134,7 @@ def test_a_narrow_neck_with_a_screen_has_a_finer_level_unless_the_spacing_is_giv
     assert sizes_mm(braided, across_mm / 33) == (across_mm / 33,)
     assert sizes_mm(replace(braided, media=(), solids=()), open_mm) == (open_mm,)
     assert sizes_mm(with_numerics(braided, cell_size_mm=open_mm), open_mm) == (open_mm,)
-    assert sizes_mm(with_numerics(braided, device_gpu=True), open_mm) == (open_mm,)
+    assert sizes_mm(with_numerics(braided, device_gpu=True), open_mm) == (open_mm, open_mm / 2)
     field = simulate_case(with_numerics(braided, cell_size_mm=CELL_MM))
     assert f"Under-resolved neck: it has {across_mm / CELL_MM:.0f} cells across" in field.advice
 

@@ -14,22 +14,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from shapes import sphere
 from tubes import line, tube
 
 from vstent.cli import main
 from vstent.errors import FlowError, InputError
 from vstent.flow import domain
-from vstent.flow.case import FlowCase, Sheet
-from vstent.flow.lattice import gpu as gpus, state as lattice_state, stepping
+from vstent.flow.case import FlowCase, Sheet, Target
+from vstent.flow.domain import Domain
+from vstent.flow.lattice import gpu as gpus, levels, state as lattice_state, stepping
 from vstent.flow.lattice.checkpoint import pack
 from vstent.flow.lattice.cost import GPU_BYTES_PER_CELL, estimate, refuse_too_large
 from vstent.flow.lattice.engine import LatticeBoltzmann, PulsatileLatticeBoltzmann
-from vstent.flow.lattice.kernels import d3q19
-from vstent.flow.lattice.recording import NotRecordedError, Pairs, plan, recorded
+from vstent.flow.lattice.kernels import d3q19, exchange, warm
+from vstent.flow.lattice.recording import SEQUENCES, NotRecordedError, Pairs, plan, recorded
 from vstent.flow.lattice.setup import Grid
 from vstent.flow.problem import vessel_case
 from vstent.flow.settings import Blood, CarreauYasuda, FlowSettings, Numerics, Waveform
 from vstent.flow.simulation import engine_class, foretell_cost, simulate_case
+from vstent.geometry.surface import Surface
+from vstent.kernels.arrays import Bools
 from vstent.kernels.directions import VELOCITIES
 from vstent.study import repeat
 from vstent.study.repeat import provenance
@@ -75,7 +79,7 @@ from dataclasses import replace
 from pathlib import Path
 import numpy as np
 from vstent.flow.lattice.checkpoint import pack
-from vstent.flow.lattice.recording import Pairs
+from vstent.flow.lattice.recording import SEQUENCES
 from vstent.flow.lattice.stepping import advance, step
 
 waits, ahead = (pickle.loads(Path(sys.argv[1]).read_bytes()) for _ in range(2))
@@ -84,7 +88,7 @@ for one in (waits, ahead):
     one.pace, one.check_s, one.since_check = np.array([4, 2]), 4 * one.scales.step_s, 0
     step(one)
 device = ahead.device
-device._replay = {pairs: lambda pairs=pairs: device.make(pairs) for pairs in Pairs}
+device._replay = {one: lambda one=one: device.make(*one) for one in SEQUENCES}
 for one in (waits, ahead):
     step(one)
 assert waits.begun_s is None
@@ -103,13 +107,47 @@ for (name, one), other in zip(saved.items(), pack(waits).values()):
 for one in (waits, waits, ahead, ahead):
     step(one)
 assert np.array(waits.history).tobytes() == np.array(ahead.history).tobytes()
+assert ahead.begun_s is not None
+for name in ("built", "links"):  # the force on wires is read from the populations of the last check
+    links = replace(ahead.built[0] if name == "built" else ahead.links, of_wires=np.zeros(1, np.int32))
+    setattr(ahead, name, (links, ahead.built[1]) if name == "built" else links)
+step(ahead)
+assert ahead.begun_s is None
 """
 
 
-def screen() -> Sheet:
+NESTED = """
+import pickle, sys
+from dataclasses import replace
+from pathlib import Path
+import numpy as np
+from vstent.flow.lattice.checkpoint import pack
+from vstent.flow.lattice.stepping import advance, step, twin
+
+state, same = (pickle.loads(Path(sys.argv[1]).read_bytes()) for _ in range(2))
+is_whole = len(state.levels) == 2
+for one in (state, same)[: 1 + is_whole]:
+    one.case = replace(state.case, numerics=replace(state.case.numerics, device_gpu=True))
+    advance(one, 2)
+if is_whole:
+    for (name, one), other in zip(pack(state).items(), pack(same).values()):
+        assert name == "loop_seconds" or one.tobytes() == other.tobytes()
+    step(state)
+    assert [level.device is not None for level in state.levels] == [True, True]  # the next steps are longer
+    other = twin(state)
+    assert other.device is None
+    for one in (state, other):
+        advance(one, 2)
+    for (name, one), other in zip(pack(state).items(), pack(other).values()):
+        assert name == "loop_seconds" or one.tobytes() == other.tobytes()
+np.savez(sys.argv[2], **pack(state))
+"""
+
+
+def screen(middle_mm: float = 0.5 * LENGTH_MM) -> Sheet:
     x, y = (a.ravel() for a in np.meshgrid(np.arange(-1.0, 1.0, 0.1), np.arange(-1.0, 1.0, 0.1)))
     n = len(x)
-    points, normals = np.stack([x, y, np.full(n, 0.5 * LENGTH_MM)], axis=1), np.tile([0.0, 0.6, 0.8], (n, 1))
+    points, normals = np.stack([x, y, np.full(n, middle_mm)], axis=1), np.tile([0.0, 0.6, 0.8], (n, 1))
     one = np.ones(n)
     return Sheet(points, normals, 0.01 * one, 300 * one, 150 * one, 0.5 * one, one, one)
 
@@ -175,14 +213,71 @@ def test_a_gpu_makes_the_steps_that_a_processor_makes(tmp_path: Path, monkeypatc
     simulate(ON_GPU, tmp_path, state)
     stepping.step(state)
     wanted = pack(state)
-    with np.load(tmp_path / "found.npz") as archive:
+    assert wanted["steps"] == state.pace[0]
+    agree(tmp_path, wanted)
+
+
+def agree(folder: Path, wanted: dict[str, np.ndarray]) -> None:
+    """Compare what a script has saved with what is wanted."""
+    with np.load(folder / "found.npz") as archive:
         found = dict(archive)
-    assert found["steps"] == wanted["steps"] == state.pace[0]
+    assert found["steps"] == wanted["steps"]
     for saved in (found, wanted):  # an opening's columns are of different sizes
         saved |= {f"opening's {k}": column for k, column in enumerate(saved.pop("0 openings").T)}
     for name in wanted.keys() - {"loop_seconds"}:
-        most = np.abs(wanted[name]).max(initial=0.0)
+        of_kind = name.replace("refill", "populations")  # whose differences it holds
+        most = np.abs(wanted[of_kind]).max(initial=0.0)
         np.testing.assert_allclose(found[name], wanted[name], rtol=0, atol=ROUNDING * most, err_msg=name)
+
+
+def nested(
+    levels_wanted: int, length_mm: float, reach_mm: float, monkeypatch: pytest.MonkeyPatch
+) -> lattice_state.State:
+    """A pulse of shear-thinning blood in a thin tube on two or three levels, with a screen across a border of them."""
+
+    def within(reach_mm: float, grid: Domain) -> Bools:
+        return np.abs(grid.centers_mm[:, 2] - 0.5 * length_mm) < reach_mm
+
+    monkeypatch.setattr(domain, "MIN_CELLS", 30)
+    monkeypatch.setattr(levels, "near_sac", lambda _, grid: within(reach_mm, grid))
+    if levels_wanted == 3:
+        monkeypatch.setattr(levels, "near_wires", lambda _, grid, __: within(0.1, grid))
+        monkeypatch.setattr(levels, "around_wires_mm", lambda _: 0.25 * CELL_MM)
+    settings = FlowSettings(
+        inflow_mL_s=0.3,
+        blood=Blood(viscosity_Pa_s=0.00345, thinning=CarreauYasuda()),
+        waveform=Waveform(0.05, (0.5,), (0.2,)),
+        numerics=Numerics(cell_size_mm=0.5 * CELL_MM, lattice_speed=0.05, refine=("sac",)),
+    )
+    ball = Surface(sphere(0.3).vertices_mm + np.array([0, 0, 0.5 * length_mm]), sphere(0.3).faces)
+    media = (screen(0.5 * length_mm - reach_mm),)
+    case = vessel_case(tube(line(length_mm), 0.5, around=32).vessel, settings, target=Target(ball, None), media=media)
+    state = PulsatileLatticeBoltzmann(0.5 * CELL_MM).init(case, None)
+    pace, check_s = np.array([54, 48]), 54 * state.scales.step_s
+    for depth, level in enumerate(state.levels):
+        level.pace, level.check_s = 2**depth * pace, check_s
+    assert len(state.levels) == levels_wanted
+    assert all(len(level.screen.cell) > 2 for level in state.levels[:2])
+    stepping.advance(state, 46 if levels_wanted == 2 else 40)
+    assert all(np.abs(level.interface.push).min() > 1e-4 for level in state.levels[:-1])
+    assert all(np.abs(level.interface.lack).min() > 1e-4 for level in state.levels[:-1])
+    return state
+
+
+@pytest.mark.parametrize(("levels_wanted", "length_mm", "reach_mm"), [(2, 4.0, 0.3), (3, 8.0, 2.3)])
+def test_levels_exchange_on_a_gpu_as_on_a_processor(
+    levels_wanted: int, length_mm: float, reach_mm: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    warm.flow()
+    state = nested(levels_wanted, length_mm, reach_mm, monkeypatch)
+    exchanges = exchange.take, exchange.add_crossed, exchange.jumps, exchange.answer, exchange.carry
+    assert [len(kernel.signatures) for kernel in exchanges] == 5 * [1]  # all have been compiled ahead
+    simulate(NESTED, tmp_path, state)
+    stepping.advance(state, 2)
+    if levels_wanted == 2:
+        stepping.step(state)
+        stepping.advance(state, 2)
+    agree(tmp_path, pack(state))
 
 
 def test_a_gpu_goes_on_while_the_host_judges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -212,14 +307,12 @@ def test_the_next_flow_of_a_vessel_has_the_numbering_of_the_first() -> None:
 @pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 100])
 @pytest.mark.parametrize("first_pair", [0, 1, 7, 8, 13])
 def test_sequences_make_every_pair_once_and_end_at_home(first_pair: int, count: int) -> None:
-    due = [pair % lattice_state.DEFER_PAIRS == 0 for pair in range(first_pair, first_pair + count)]
-    made: list[Pairs] = []
-    for pairs in plan(first_pair, count):
-        is_round = pairs is Pairs.ROUND
-        made += [Pairs.CORRECTED] + 7 * [Pairs.PLAIN] if is_round else [pairs]
-    assert [pair is Pairs.CORRECTED for pair in made] == due
-    assert [pair is Pairs.LAST for pair in made[:-1]] == (count - 1) * [False]
-    assert made[-1] is (Pairs.CORRECTED if due[-1] else Pairs.LAST)
+    made: list[tuple[Pairs, int]] = []
+    for pairs, number in plan(first_pair, count):
+        assert (pairs, number) in SEQUENCES
+        made += [(Pairs.PLAIN, k) for k in range(8)] if pairs is Pairs.ROUND else [(pairs, number)]
+    assert [number for _, number in made] == [pair % 8 for pair in range(first_pair, first_pair + count)]
+    assert [pairs for pairs, _ in made] == [*(count - 1) * [Pairs.PLAIN], Pairs.LAST]
 
 
 class Driver:

@@ -16,8 +16,7 @@ from vstent.flow.lattice.stepping import build, take_pace
 def pack(state: State) -> Saved:
     """Return the arrays of a run that cannot be rebuilt from its case and grids."""
     for level in state.levels:
-        if level.device is not None:
-            level.device.fetch(level)
+        level.fetch()
     saved = {
         "check_s": np.array(state.check_s),
         "pace": state.pace,

@@ -32,8 +32,9 @@ BYTES_PER_BOX_POINT = 15
 MOST_CELLS = 1e8
 """Maximum number of cells whose 19 populations can be addressed with 32 bits, cells beside the wall included (2^31 / 19
 storage places)."""
-GPU_BYTES_PER_CELL = 320
-"""GPU memory in bytes per cell of blood (sum of the arrays: 218 on 28,000 cells of a tube)."""
+GPU_BYTES_PER_CELL, GPU_BYTES_AROUND_WIRES = 320, 600
+"""GPU memory in bytes per cell of blood, and on levels around wires, of which many cells are interpolated (sums of
+the arrays: 218 on 28,000 cells of a tube, 277 with a level in the sac, 480 around Enterprise from 0.25 to 0.031 mm)."""
 BYTES_AT_LEAST = 4.5e8
 """Memory in bytes of the program itself, its compiled kernels and one surface."""
 WHOLE_OVER_BLOCK = 3.5
@@ -114,7 +115,20 @@ def refuse_too_large(case: FlowCase, free_bytes: float | None = None, gpu_bytes:
     _refuse(case, lambda cell_mm: _size(case, cell_mm)[1], free_bytes, "memory")
     if case.numerics.device_gpu:
         gpu_bytes = free_gpu_bytes() if gpu_bytes is None else gpu_bytes
-        _refuse(case, lambda cell_mm: GPU_BYTES_PER_CELL * _size(case, cell_mm)[0], gpu_bytes, "the GPU's memory")
+        _refuse(case, lambda cell_mm: _gpu_bytes(case, cell_mm), gpu_bytes, "the GPU's memory")
+
+
+def fits(case: FlowCase) -> bool:
+    """Return whether a flow fits in the free memory, and in the GPU's memory if it runs there."""
+    is_here = not case.numerics.device_gpu
+    fits_there = is_here or _gpu_bytes(case, default_cell_size_mm(case)) < free_gpu_bytes()
+    return fits_there and memory_bytes(case) < free_memory_bytes()
+
+
+def _gpu_bytes(case: FlowCase, cell_size_mm: float) -> float:
+    """Return the memory of a flow on a GPU."""
+    of_levels, kept = _cells(case, cell_size_mm), 1 + case.numerics.coarser_levels
+    return GPU_BYTES_PER_CELL * sum(of_levels[:kept]) + GPU_BYTES_AROUND_WIRES * sum(of_levels[kept:])
 
 
 def _refuse(case: FlowCase, needed_bytes: Callable[[float], float], free_bytes: float, of: str) -> None:

@@ -1,5 +1,6 @@
 """The embedded engine: sparse D3Q19 lattice-Boltzmann, single precision, interpolated walls; steady or pulsatile."""
 
+from abc import abstractmethod
 from dataclasses import dataclass, replace
 from typing import ClassVar, Final
 
@@ -87,6 +88,16 @@ class AbstractLattice(AbstractEngine[State]):
         stepping.step(state)
         return state
 
+    def terminate(self, state: State) -> float | None:
+        """Return what is `left` at a check; None between checks; nan when the run has diverged."""
+        if state.since_check:
+            return None
+        return float("nan") if any(level.snapshots[-1].is_lost for level in state.kept) else self.left(state)
+
+    @abstractmethod
+    def left(self, state: State) -> float:
+        """Return the residual at a check."""
+
     def trouble(self, state: State) -> str:
         """Return a sentence that says why the run diverged."""
         return trouble(state)
@@ -113,15 +124,8 @@ class LatticeBoltzmann(AbstractLattice):
                 level.blocks = with_check(level.blocks, level.snapshots[-1])
         return state
 
-    def terminate(self, state: State) -> float | None:
-        """Return the distance from convergence or the error of the time averages, whichever is smaller.
-
-        None between checks; nan when the run has diverged.
-        """
-        if state.since_check:
-            return None
-        if any(level.snapshots[-1].is_lost for level in state.kept):
-            return float("nan")
+    def left(self, state: State) -> float:
+        """Return the distance from convergence or the error of the time averages, whichever is smaller."""
         return min(_left(state), _mean(state).left)
 
     def max_checks(self, state: State) -> int:
@@ -152,15 +156,8 @@ class PulsatileLatticeBoltzmann(AbstractLattice):
         phase_s, steps = case.pulse.period_s / PHASES, pace(case, self.coarsest_mm(case), start)
         return stepping.build(case, self.cell_size_mm, phase_s, steps, start=start, kept=PHASES)
 
-    def terminate(self, state: State) -> float | None:
-        """Return the relative difference of the monitored quantities between the last two cycles.
-
-        None between checks; inf within a cycle; nan when the run has diverged.
-        """
-        if state.since_check:
-            return None
-        if any(level.snapshots[-1].is_lost for level in state.kept):
-            return float("nan")
+    def left(self, state: State) -> float:
+        """Return the relative difference of the monitored quantities between the last two cycles; inf within one."""
         change = cycle_change(np.array(state.history))
         return max(change, _outflow_error(state)) if state.case.resistances and np.isfinite(change) else change
 

@@ -80,7 +80,7 @@ def _layout(state: State) -> Layout:
     slot = np.zeros(len(order), np.int32)
     slot[order] = np.arange(len(order), dtype=np.int32)
     # A near link needs a population that arrives at its cell: its wall is nearer than half-way.
-    is_near = (links.weight[:, 1] != 0) & (links.path[0, :, 1] == links.address[:, 1])
+    is_near = (links.weight[:, 1] != 0)[: len(slot)] & (links.path[0, : len(slot), 1] == links.address[:, 1])
     special = np.unique(np.concatenate([cell, refilled_cell]))
     ends, is_end = int(links.start[-1]), np.arange(len(slot)) < links.start[-1]
     of_cell, of_link = np.zeros((4, len(special)), np.int32), np.searchsorted(special, cell)

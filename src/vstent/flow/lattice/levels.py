@@ -22,8 +22,8 @@ differently. Blood that is set anew in each exchange would have to be accelerate
 across a tube of six coarse cells would take the pressure that falls over two cells. Momentum normal to the border is
 therefore added to the cells that are set. It is integrated from what remains: on the coarser grid the mass that crosses
 too much, on the finer one the difference of pressure between both grids in the layer between. It is bounded
-(`MOST_PUSHED`), because wires that cross a border keep such a difference. Where a refined part has a single border,
-nothing flows through it in sum, and no momentum is added: beside a neck it would stir the sac.
+(`exchange.MOST_PUSHED`), because wires that cross a border keep such a difference. Where a refined part has a single
+border, nothing flows through it in sum, and no momentum is added: beside a neck it would stir the sac.
 """
 
 from dataclasses import dataclass, replace
@@ -58,16 +58,16 @@ CARRIED_DOWN: Final = (1, 2)
 """Layers in which the finer level is set from the coarser one."""
 CARRIED_UP: Final = (4, 5)
 """Layers in which the coarser level is set from the finer one."""
+CARRIED_CELLS: Final = float(len(CARRIED_DOWN) * WIDTH**3), float(len(CARRIED_UP))
+"""Numbers of finer and of coarser cells that are set for each coarser cell of the layer between."""
+OF_SHEAR: Final = np.float32(0.5 * (1 - 1 / WIDTH**2))
+"""Part of the correction in shear flow with which densities on both grids are compared (see `collision.carried`)."""
 OWN_LAYER: Final = 4
 """First layer in which the finer level counts: mass that crosses into it is compared."""
 RIM: Final = 3
 """Number of layers added around the cells to be refined."""
 OPENING_CELLS: Final = 2
 """Distance in cells to which a refined part approaches the end of an opening, which only the coarsest level has."""
-LACK_PART: Final = 0.15
-"""Under-relaxation factor with which the mass returned to the coarser level follows what crossed."""
-PUSH_PART: Final = 0.05
-"""Part of the momentum still missing at a border that is added in each exchange."""
 UPSTREAM_DIAMETERS, DOWNSTREAM_DIAMETERS = 5.0, 1.0
 """Extent of the refined part from the sac towards the inlet and the outlets, in mean diameters 4 V / A of the vessel.
 The flow into the sac forms upstream: beside the same spacing everywhere (0.14 mm) the demo's neck inflow is 2 % lower
@@ -87,8 +87,6 @@ CHANGING: Final = ("crossed", "lack", "push")
 """Arrays of an `Interface` that change during a run."""
 CHUNK: Final = 10_000
 """Number of cells whose stencils are computed at once."""
-MOST_PUSHED: Final = 0.03
-"""Largest momentum that is added at a border, over that of the cells that are set."""
 REACH: Final = 1.2
 """Standard deviation in cells of the weights of a fit beside a wall."""
 RIDGE: Final = 1e-3
@@ -372,7 +370,7 @@ def around_wires_mm(case: FlowCase) -> float:
     numerics = case.numerics
     if numerics.wires == "resolved" and case.wires is not None:
         return thickness_mm(case.wires) / domains.LEAST_ACROSS
-    if case.has_screen and case.ostium is not None and numerics.cell_size_mm is None and not numerics.device_gpu:
+    if case.has_screen and case.ostium is not None and numerics.cell_size_mm is None:
         return neck_diameter_mm(case.ostium) / max(numerics.cells_across_neck, 1e-9)
     return inf
 

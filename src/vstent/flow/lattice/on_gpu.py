@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from vstent.flow.lattice.gpu_tables import PAIRS, START, correction_of, joined, layout_of, rates_of, tables_of
 from vstent.flow.lattice.kernels import d3q19, gpu as kernels
 from vstent.flow.lattice.kernels.gpu import THREADS
-from vstent.flow.lattice.recording import NotRecordedError, Pairs, plan, recorded
+from vstent.flow.lattice.levels import CARRIED_CELLS, OF_SHEAR, WIDTH, Interface, Stencil
+from vstent.flow.lattice.recording import SEQUENCES, NotRecordedError, Pairs, plan, recorded
 from vstent.flow.lattice.state import DEFER_PAIRS, DEFER_PART, State
 from vstent.kernels.arrays import Floats, Ints
 
@@ -43,13 +44,15 @@ class Launch:
 
 
 class Device:
-    """The arrays of a run on the GPU and its kernels."""
+    """The arrays of a level on the GPU and its kernels; that of the coarsest level makes the steps of all."""
 
     def __init__(self, state: State) -> None:
-        """Copy all arrays that the time steps need to the GPU."""
+        """Copy all arrays that the time steps need to the GPU; those of finer levels are there already."""
         a, links, at = state.addressing, state.links, tables_of(state)
         cells, ends = len(a.place), int(links.start[-1])
-        self._at, self._slot, self.stream = at, layout_of(state).slot, cuda.stream()
+        self._at, self._slot = at, layout_of(state).slot
+        finer: Device | None = None if state.finer is None else state.finer.device
+        self.stream: Any = cuda.stream() if finer is None else finer.stream
         self._populations, self._shape = put(state.populations), put(links.shape)
         self._integers, self._singles, self._doubles = put(at.integers), put(at.singles), put(at.doubles)
         blocks = len(layout_of(state).tables[kernels.BLOCKS])
@@ -67,6 +70,12 @@ class Device:
             Launch(kernels.defer, len(links.address) - ends, common),
             Launch(kernels.balance, max(1, len(state.refill.groups[0]) - 1), common[1:]),
         )
+        crossing = links.path[0, len(links.address) :, :2].T
+        self.grid, self.passed = (self._populations, a.stride, self._singles), put(np.zeros(crossing.shape[1]))
+        self._cross = Launch(kernels.add_crossed, crossing.shape[1], (self._populations, put(crossing), self.passed))
+        self._border = None
+        if finer is not None and state.interface is not None:
+            self._border = Border(self, finer, state.interface, crossing.shape[1])
         density, velocity = put(np.zeros(cells, np.float32)), put(np.zeros((cells, 3), np.float32))
         through_ends = put(np.zeros(ends))
         self._read = (
@@ -84,7 +93,7 @@ class Device:
             Launch(kernels.rescale, cells, (*of_links, *of_cells)),
             Launch(kernels.resend, len(links.address), (*of_links, self._through)),
         )
-        self._replay: dict[Pairs, Any] | None = None
+        self._replay: dict[tuple[Pairs, int], Any] | None = None
         self._why = ""
         self._begun = 0
 
@@ -96,7 +105,7 @@ class Device:
     @property
     def nbytes(self) -> int:
         """Return the memory of the run on the GPU, in bytes."""
-        launches = *self._steps, *self._settle, *self._read, *self._lengthen
+        launches = *self._read, *self._lengthen, *(launch for launch, _ in self.launches(Pairs.LAST, 0))
         arrays = {id(array): array for launch in launches for array in launch.arguments if hasattr(array, "nbytes")}
         return sum(array.nbytes for array in arrays.values())
 
@@ -134,37 +143,52 @@ class Device:
         whole[: len(rows)] = rows
         self._doubles[self._at.places[kernels.IMPOSED]].copy_to_device(whole.ravel())
         self._integers[: len(START)].copy_to_device(np.array(START, np.int32))
-        for pairs in plan(first_pair, len(rows)):
+        for sequence in plan(first_pair, len(rows)):
             if self._replay:
-                self._replay[pairs]()
+                self._replay[sequence]()
             else:
-                self.make(pairs)
+                self.make(*sequence)
 
-    def _recorded(self) -> dict[Pairs, Any]:
+    def _recorded(self) -> dict[tuple[Pairs, int], Any]:
         """Return functions that replay each sequence of pairs; empty where they cannot be recorded."""
         try:
-            return {pairs: recorded(partial(self.make, pairs), self.stream) for pairs in Pairs}
+            return {sequence: recorded(partial(self.make, *sequence), self.stream) for sequence in SEQUENCES}
         except NotRecordedError as reason:
-            self.stream, self._why = cuda.stream(), f", because {reason}"
+            self._why, self.stream, level = f", because {reason}", cuda.stream(), self
+            while level._border is not None:
+                level = level._border.finer
+                level.stream = self.stream
             return {}
 
-    def make(self, pairs: Pairs) -> None:
+    def make(self, pairs: Pairs, number: int) -> None:
         """Launch the kernels of pairs of time steps one by one."""
-        for launch, further in self.launches(pairs):
+        for launch, further in self.launches(pairs, number):
             launch(self.stream, *further)
 
-    def launches(self, pairs: Pairs) -> Iterator[tuple[Launch, tuple[Any, ...]]]:
-        """Yield the kernels of pairs of time steps in their order, with their further arguments."""
+    def launches(self, pairs: Pairs, number: int) -> Iterator[tuple[Launch, tuple[Any, ...]]]:
+        """Yield the kernels of pairs of time steps on this level and finer ones in order, with their further arguments.
+
+        `number` is that of the first pair. Where there is a finer level, populations come home for the exchange.
+        """
         if pairs is Pairs.ROUND:
-            for one in (Pairs.CORRECTED, *(DEFER_PAIRS - 1) * (Pairs.PLAIN,)):
-                yield from self.launches(one)
+            for k in range(DEFER_PAIRS):
+                yield from self.launches(Pairs.PLAIN, k)
             return
         drive, even_step, swap, odd_step = self._steps
-        last = odd_step, (int(pairs is not Pairs.PLAIN),)
-        yield from ((drive, ()), (even_step, ()), (swap, ()), last, (swap, ()))
-        if pairs is not Pairs.PLAIN:  # 0 brings populations home and leaves the walls as they are
-            part = np.float32(DEFER_PART if pairs is Pairs.CORRECTED else 0.0)
+        is_due = number % DEFER_PAIRS == 0
+        goes_home = is_due or pairs is Pairs.LAST or self._border is not None
+        yield drive, ()
+        if self._border is not None:
+            yield self._border.take, ()
+        yield from ((even_step, ()), (self._cross, (1,)), (swap, ()))
+        yield from ((odd_step, (int(goes_home),)), (self._cross, (-1,)), (swap, ()))
+        if goes_home:  # 0 brings populations home and leaves the walls as they are
+            part = np.float32(DEFER_PART if is_due else 0.0)
             yield from ((launch, (part,)) for launch in self._settle)
+        if self._border is not None:
+            for half, of_half in enumerate((Pairs.PLAIN, Pairs.LAST)):
+                yield from self._border.finer.launches(of_half, WIDTH * number + half)
+            yield from ((launch, ()) for launch in self._border.couple)
 
     def rescale(self, state: State, stretch: float, stress: float) -> None:
         """Take links and screen of `state`, and convert populations to its time step."""
@@ -210,12 +234,54 @@ class Device:
         state.links.openings[:] = self._openings()
         places = self._at.places
         link = self._singles[places[kernels.LINK]].copy_to_host().reshape(-1, 2)
-        state.links.source[:] = link[self._slot, 1]
+        state.links.source[: len(self._slot)] = link[self._slot, 1]
         state.refill.refill[:] = self._singles[places[kernels.REFILL]].copy_to_host()[self._at.refilled]
+        if self._border is not None and state.interface is not None:
+            state.interface.lack[:], *state.interface.push[:] = self._border.held.copy_to_host()
 
     def _openings(self) -> Floats:
         """Return `Links.openings` as they are on the GPU."""
         return np.asarray(self._doubles[self._at.places["openings"]].copy_to_host()).reshape(-1, d3q19.OPENING)
+
+
+class Border:
+    """What a level exchanges with the next finer one."""
+
+    def __init__(self, coarse: Device, fine: Device, between: Interface, links: int) -> None:
+        """Copy the coupling to the GPU; `links` is the number of links across borders of the coarser level."""
+        self.finer, (place, finer, group) = fine, between.between
+        order, of_coarse, of_fine = np.argsort(group, kind="stable"), *(one.start for one in between.border)
+        of_cells = np.searchsorted(group[order], np.arange(len(of_fine)))
+        first = np.stack([of_fine, links - of_coarse[-1] + of_coarse, of_cells]).astype(np.int32)
+        self.held, found = put(np.stack([between.lack, *between.push])), put(np.zeros((2, len(place))))
+        beside = (put(array) for array in (between.beside, between.group.astype(np.int32), between.share))
+        jumping = *coarse.grid[:2], *fine.grid[:2], put(place[order]), put(finer[order].T), OF_SHEAR, found
+        answering = put(first), coarse.passed, fine.passed, found, self.held, CARRIED_CELLS, 1 / WIDTH**3
+        self.take = Launch(kernels.take, len(between.beside), (coarse.grid[0], *beside, self.held))
+        up = *fine.grid, *coarse.grid, *stencil_of(between.up, WIDTH), self.held[2]
+        down = *coarse.grid, *fine.grid, *stencil_of(between.down, 1 / WIDTH), self.held[1]
+        self.couple = (
+            Launch(kernels.jumps, len(place), jumping),
+            Launch(kernels.answer, len(between.lack) * THREADS, answering),
+            Launch(kernels.carry, len(between.up.target), up),
+            Launch(kernels.carry, len(between.down.target), down),
+        )
+
+
+def stencil_of(along: Stencil, ratio: float) -> tuple[Any, Any]:
+    """Return a stencil of n cells with k entries at most on the GPU; neighbouring threads read neighbouring values.
+
+    It is (3 + k, n) storage place, group, number of entries, and storage places of the cells read, and (5 + 2 k, n)
+    limit, shares, ratio of the spacings, and weights.
+    """
+    count = np.diff(along.start)
+    target = np.repeat(np.arange(len(count)), count)
+    entry, most = np.arange(len(target)) - along.start[target], int(count.max(initial=0))
+    cells, parts = np.zeros((3 + most, len(count)), np.int32), np.zeros((5 + 2 * most, len(count)), np.float32)
+    cells[:3], parts[0], parts[1:4], parts[4] = (along.target, along.group, count), along.limit, along.share.T, ratio
+    cells[3 + entry, target] = along.place[along.cell]
+    parts[5 + 2 * entry, target], parts[6 + 2 * entry, target] = along.weight.T
+    return put(cells), put(parts)
 
 
 def seconds_of_update(place: Ints, length: Ints, stride: int, relaxation: Sequence[Any]) -> float:

@@ -165,7 +165,7 @@ def _remarks(state: State, levels: Sequence[Level], phases: Sequence[Phase]) -> 
             remarks += (
                 f" Under-resolved neck: it has {across:.0f} cells across. With fewer than {FEWEST_ACROSS_NECK} behind "
                 "a dense braid, neck inflow and sac velocity are up to a third too high: use a grid spacing of "
-                f"{across / FEWEST_ACROSS_NECK * finest.cell_size_mm:.2g} mm or, on the processor, leave it open."
+                f"{across / FEWEST_ACROSS_NECK * finest.cell_size_mm:.2g} mm, or leave it open."
             )
     if len(state.levels) > 1:
         sizes = ", ".join(f"{one.domain.cell_size_mm:.3g} mm ({len(one.domain.cells):,} cells)" for one in state.levels)
@@ -187,8 +187,7 @@ def _remarks(state: State, levels: Sequence[Level], phases: Sequence[Phase]) -> 
 
 def force_N(state: State) -> Floats:
     """Return the force (3,) of the blood on the wires that are walls."""
-    if state.device is not None:
-        state.device.fetch(state)
+    state.fetch()
     links = state.links
     momentum = exchanged(state.populations, links.address[links.of_wires], links.wire_direction)
     return momentum.sum(axis=0) * _newton(state)
@@ -196,6 +195,7 @@ def force_N(state: State) -> Floats:
 
 def forces_N(state: State) -> tuple[Floats, Floats]:
     """Return cells (m, 3), mm, of a level, and the force (m, 3) of their blood on wires beside them and on a screen."""
+    state.fetch()
     links, a, screen = state.links, state.addressing, state.screen
     address = links.address[links.of_wires]
     on_walls = exchanged(state.populations, address, links.wire_direction)

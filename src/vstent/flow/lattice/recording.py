@@ -6,7 +6,8 @@ The host then launches a graph instead of every kernel.
 import weakref
 from collections.abc import Callable, Iterator
 from enum import Enum
-from typing import Any
+from itertools import product
+from typing import Any, Final
 
 from numba import config
 
@@ -19,27 +20,26 @@ class Pairs(Enum):
     PLAIN = 1
     """One pair; populations near walls are not at home afterwards (see `kernels`)."""
     LAST = 2
-    """One pair, after which populations are at home."""
-    CORRECTED = 3
-    """One pair, after which walls are updated; populations are then at home."""
-    ROUND = 4
-    """`DEFER_PAIRS` pairs, of which the first is `CORRECTED` and the others are `PLAIN`."""
+    """One pair, after which populations are at home; where it is due, walls are updated."""
+    ROUND = 3
+    """`DEFER_PAIRS` pairs, of which walls are updated after the first."""
 
 
-def plan(first_pair: int, count: int) -> Iterator[Pairs]:
+SEQUENCES: Final = ((Pairs.ROUND, 0), *product((Pairs.LAST, Pairs.PLAIN), range(DEFER_PAIRS)))
+"""All that `plan` yields: pairs, and the number of the first since walls were last due to be updated."""
+
+
+def plan(first_pair: int, count: int) -> Iterator[tuple[Pairs, int]]:
     """Yield the sequences that make up `count` pairs of steps; populations are at home after the last.
 
-    The number of the first pair counts from the last check; every `DEFER_PAIRS`-th pair is `CORRECTED`.
+    The number of the first pair counts from the last check; walls are due to be updated after every `DEFER_PAIRS`-th.
     """
     pair, end = first_pair, first_pair + count
     while pair < end:
-        is_due = pair % DEFER_PAIRS == 0
-        if is_due and end - pair > DEFER_PAIRS:
-            yield Pairs.ROUND
-            pair += DEFER_PAIRS
-            continue
-        yield Pairs.CORRECTED if is_due else Pairs.LAST if pair + 1 == end else Pairs.PLAIN
-        pair += 1
+        number = pair % DEFER_PAIRS
+        is_round = number == 0 and end - pair > DEFER_PAIRS
+        yield Pairs.ROUND if is_round else Pairs.LAST if pair + 1 == end else Pairs.PLAIN, number
+        pair += DEFER_PAIRS if is_round else 1
 
 
 class NotRecordedError(Exception):

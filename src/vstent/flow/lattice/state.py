@@ -162,6 +162,11 @@ class State:
         """Return this grid and the finer ones inside it, coarse to fine."""
         return (self,) if self.finer is None else (self, *self.finer.levels)
 
+    def fetch(self) -> None:
+        """Copy what a GPU has changed on this level back to the arrays here."""
+        if self.device is not None:
+            self.device.fetch(self)
+
     @property
     def kept(self) -> "tuple[State, ...]":
         """Return the levels whose flow is a result: all but those finer than the grid spacing."""

@@ -19,11 +19,8 @@ from vstent.flow.lattice.gpu import require_gpu, told
 from vstent.flow.lattice.kernels import d3q19, exchange
 from vstent.flow.lattice.kernels.warm import keep_flow
 from vstent.flow.lattice.levels import (
-    CARRIED_DOWN,
-    CARRIED_UP,
-    LACK_PART,
-    MOST_PUSHED,
-    PUSH_PART,
+    CARRIED_CELLS,
+    OF_SHEAR,
     WIDTH,
     Interface,
     Stencil,
@@ -153,8 +150,8 @@ def _grids(case: FlowCase, cell_size_mm: float) -> list[tuple[Grid, Interface | 
     part = (case.sac, case.numerics.refine, case.is_split_given) if len(sizes) > 1 else None
     key = sizes, part, case.solids if are_walls else ()
     if key not in built:
-        for of_walls in [other for other in built if other[2]]:  # of another device, or of another tile of it
-            del built[of_walls]
+        for others in [other for other in built if other[2] and are_walls]:  # of another device, or tile of it
+            del built[others]
         domain = domains.build(case.vessel, coarsest_mm, wires=domains.wires_of(case, coarsest_mm))
         limit = thickest(case, domain)
         grids: list[tuple[Grid, Interface | None]] = [(Grid(domain, limit, address(domain, limit)), None)]
@@ -169,17 +166,15 @@ def _grids(case: FlowCase, cell_size_mm: float) -> list[tuple[Grid, Interface | 
 def place_screen(state: State, case: FlowCase) -> None:
     """Exchange the screen of a run for that of a case; the flow does not change."""
     for level in state.levels:
-        if level.device is not None:
-            level.device.fetch(level)
-            level.device = None
+        level.fetch()
+        level.device = None
         entries = build_screen(case, level.domain, level.addressing, level.scales)
         level.case, level.screen, level.built = case, entries, (level.built[0], entries)
 
 
 def twin(state: State) -> State:
     """Return a second run with the same flow, which goes its own way."""
-    if state.device is not None:
-        state.device.fetch(state)
+    state.fetch()
     changing = {name: getattr(state.links, name).copy() for name in ("source", "openings", "course")}
     links = replace(state.links, **changing)
     refill = replace(state.refill, lost=state.refill.lost.copy(), refill=state.refill.refill.copy())
@@ -205,7 +200,7 @@ def twin(state: State) -> State:
 def step(state: State) -> None:
     """Make time steps for a few seconds, at most up to the next check, and record the flow at a check.
 
-    A GPU goes on with the next time steps while the host evaluates the check.
+    A GPU goes on with the next time steps while the host evaluates the check, unless a result may need its populations.
     """
     began, state.begun_s = perf_counter() if state.begun_s is None else state.begun_s, None
     advance(state, _slice_steps(state))
@@ -220,7 +215,8 @@ def step(state: State) -> None:
             if state.case.resistances and len(state.history) % len(state.pace) == 0:
                 _follow(state)
             _keep_pace(state)
-            if state.device is not None:
+            are_walls = any(len(level.links.of_wires) for level in state.levels)
+            if state.device is not None and state.levels == state.kept and not are_walls:
                 with told():
                     if state.device.begin(*_pairs(state, _slice_steps(state))):
                         state.begun_s = perf_counter()
@@ -348,7 +344,8 @@ def advance(state: State, steps: int) -> None:
         with told():
             from vstent.flow.lattice.on_gpu import Device
 
-            state.device = state.device or Device(state)
+            for level in reversed(state.levels):
+                level.device = level.device or Device(level)
             state.device.advance(*pairs)
     else:
         _advance_here(state, *pairs)
@@ -416,15 +413,9 @@ def _pairs_here(state: State) -> Callable[[int], None]:
 def _couple(coarse: State, fine: State, between: Interface) -> None:
     """Couple two levels after a pair of steps of the coarser one and two pairs of the finer one."""
     exchange.add_crossed(coarse.populations, between.border[0].first, between.border[0].start, -1.0, between.crossed)
-    between.lack[:] += LACK_PART * (between.crossed - between.lack)
     of_grids = coarse.populations, coarse.addressing.stride, fine.populations, fine.addressing.stride
-    jump, speed = exchange.jumps(*of_grids, between.between, 0.5 * (1 - 1 / WIDTH**2), len(between.lack)).T
-    # Carried cells for each coarse cell between; a jump of the density d accelerates them by d / 3.
-    cells = len(CARRIED_DOWN) * WIDTH**3, len(CARRIED_UP)
-    for push, missing, count in zip(between.push, (cells[0] * jump / 3, between.crossed), cells, strict=True):
-        most = MOST_PUSHED * count * speed
-        push[:] = np.clip(push + PUSH_PART * missing, -most, most)
-    between.crossed[:] = 0.0
+    jump = exchange.jumps(*of_grids, between.between, OF_SHEAR, len(between.lack))
+    exchange.answer(between.crossed, jump, between.lack, between.push, CARRIED_CELLS)
     _carry(fine, coarse, between.up, between.push[1], WIDTH)
     _carry(coarse, fine, between.down, between.push[0], 1 / WIDTH)
 

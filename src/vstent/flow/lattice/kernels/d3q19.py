@@ -426,10 +426,7 @@ def rescale(f: Any, stride: int, places: Any, links: Any, stretch: float, stress
     for k in prange(len(links)):
         through[k] = f[links[k, 3]] - f[links[k, 0]]
     for i in prange(len(places)):
-        held = np.zeros(19, np.float32)
-        for q in range(19):
-            held[q] = f[q * stride + places[i]]
-        new = rescaled(held, stretch, stress)
+        new = rescaled(f[places[i] :: stride], stretch, stress)
         for q in range(19):
             f[OPPOSITE[q] * stride + places[i]] = new[q]
     for k in prange(len(links)):
@@ -440,11 +437,8 @@ def rescale(f: Any, stride: int, places: Any, links: Any, stretch: float, stress
 def relaxation_times(f: Any, stride: int, places: Any, time: float, law: Any) -> Any:
     """Return relaxation times (n,) of shear-thinning blood at storage `places` (n,); populations must be at home."""
     result = np.zeros(len(places), np.float32)
-    held = np.zeros(19, np.float32)
     for i in range(len(places)):
-        for q in range(19):
-            held[q] = f[q * stride + places[i]]
-        result[i] = thinned(stress_size(held), time, law)
+        result[i] = thinned(stress_size(f[places[i] :: stride]), time, law)
     return result
 
 

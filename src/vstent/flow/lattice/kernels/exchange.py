@@ -23,6 +23,12 @@ _CHUNK: Final = 256
 """Number of target cells for which a thread uses the same scratch memory."""
 _STARTS: Final = tuple(range(0, _EVEN, lanes.COUNT))
 """First of the values in each vector register that holds those of either part."""
+LACK_PART: Final = 0.15
+"""Under-relaxation factor with which the mass returned to the coarser level follows what crossed."""
+PUSH_PART: Final = 0.05
+"""Part of the momentum still missing at a border that is added in each exchange."""
+MOST_PUSHED: Final = 0.03
+"""Largest momentum that is added at a border, over that of the cells that are set."""
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
@@ -54,6 +60,16 @@ def _plus_two(total: Any, weight: float, values: Any) -> Any:
 _plus: Final = njit(cache=True, forceinline=True)(_plus_one if len(_STARTS) == 1 else _plus_two)
 
 
+@njit(cache=True, forceinline=True, error_model="numpy")
+def converted(held: Any, squares: Any, limit: Any, numbers: Any) -> tuple[Any, ...]:
+    """Return populations as on a grid of another spacing (see `collision.carried`); `numbers` as in `carry`."""
+    ratio, time, law, odd_rate, new_odd_rate = numbers
+    if law[0] > 0.0:
+        time = np.float32(thinned(stress_size(held), time, law))
+    new_time = _HALF + (time - _HALF) / ratio
+    return carried(held, squares, ratio, (time, limit, odd_rate), (new_time, limit, new_odd_rate))
+
+
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
 def carry(f: Any, stride: int, stencil: Any, push: Any, into: Any, numbers: Any) -> None:
     """Set populations of a grid by interpolation from those of another (see `collision.carried`).
@@ -73,7 +89,6 @@ def carry(f: Any, stride: int, stencil: Any, push: Any, into: Any, numbers: Any)
     """
     place, start, cell, weight, group, part = stencil
     g, new_stride, new_place, limit = into
-    ratio, time, law, odd_rate, new_odd_rate = numbers
     read = np.zeros((len(place) + 1) * _VALUES, np.float32)
     for c in prange(len(place)):
         _split(f, stride, place[c], read[c * _VALUES : (c + 1) * _VALUES])
@@ -94,12 +109,8 @@ def carry(f: Any, stride: int, stencil: Any, push: Any, into: Any, numbers: Any)
                 along = push[group[i]] * (c[0] * x + c[1] * y + c[2] * z) / (6.0 if k < 3 else 12.0)
                 odd = values[_EVEN + k] + np.float32(along)
                 held[2 * k + 1], held[2 * k + 2] = values[1 + k] + odd, values[1 + k] - odd
-            old_time = time
-            if law[0] > 0.0:
-                old_time = np.float32(thinned(stress_size(held), time, law))
-            new_time = _HALF + (old_time - _HALF) / ratio
             squares = values[10], values[11], values[12], values[13], values[14], values[15]
-            new = carried(held, squares, ratio, (old_time, limit[i], odd_rate), (new_time, limit[i], new_odd_rate))
+            new = converted(held, squares, limit[i], numbers)
             for q in range(19):
                 g[OPPOSITE[q] * new_stride + new_place[i]] = new[q]
 
@@ -118,39 +129,60 @@ def add_crossed(f: Any, first: int, start: Any, part: float, crossed: Any) -> No
         crossed[g] += part * total
 
 
-@njit(cache=True, error_model="numpy")
-def _density(f: Any, stride: int, at: int, part: float) -> tuple[Any, Any]:
-    """Return the density deviation of the cell with storage place `at` on a grid of another spacing, and its speed.
+@njit(cache=True, forceinline=True, error_model="numpy")
+def density_of(held: Any, part: Any) -> tuple[Any, Any]:
+    """Return the density deviation of a cell with these populations on a grid of another spacing, and its speed.
 
     `part` is that of the correction in shear flow (see `collision.carried`); 0 on the same grid.
     """
-    held = np.zeros(19, np.float32)
-    for q in range(19):
-        held[q] = f[q * stride + at]
     density, u, flux = moments_of(held)
-    trace = flux[0] + flux[1] + flux[2] - (u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
-    return density + np.float32(part) * (trace - density), np.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
+    squared = u[0] * u[0] + u[1] * u[1] + u[2] * u[2]
+    return density + part * (flux[0] + flux[1] + flux[2] - squared - density), lanes.root(squared)
 
 
 @njit(cache=True)
-def jumps(f: Any, stride: int, g: Any, new_stride: int, overlap: Any, part: float, groups: int) -> Any:
+def jumps(f: Any, stride: int, g: Any, new_stride: int, overlap: Any, part: Any, groups: int) -> Any:
     """Return the sums (g, 2) over groups: density of a grid less that of the finer one in the same cells, and speed.
 
     Parameters
     ----------
     f, stride, g, new_stride : populations and strides of both grids.
     overlap : tuple; (m,) storage places of coarser cells, (m, 8) of the finer ones in each, and (m,) their groups.
-    part : that of the correction in `_density`.
+    part : float32; that of the correction in `density_of`.
     """
     place, finer, group = overlap
     result = np.zeros((groups, 2))
     for c in range(len(place)):
-        difference, speed = _density(f, stride, place[c], part)
+        difference, speed = density_of(f[place[c] :: stride], part)
         for n in range(finer.shape[1]):
-            difference -= _density(g, new_stride, finer[c, n], 0.0)[0] / np.float32(finer.shape[1])
+            difference -= density_of(g[finer[c, n] :: new_stride], np.float32(0.0))[0] / np.float32(finer.shape[1])
         result[group[c], 0] += difference
         result[group[c], 1] += speed
     return result
+
+
+@njit(cache=True, forceinline=True)
+def answered(crossed: float, jump: float, speed: float, held: Any, cells: Any) -> tuple[float, float, float]:
+    """Return what a group lacks, and its momentum on the finer and on the coarser grid, from those before (3).
+
+    `crossed` is the mass that crossed the border on the finer grid and not on the coarser one, `jump` and `speed` are
+    from `jumps`. `cells` (2) are set on either grid for each coarser cell there; a jump of the density d accelerates
+    them by d / 3.
+    """
+    lack, down, up = held
+    most_down, most_up = MOST_PUSHED * cells[0] * speed, MOST_PUSHED * cells[1] * speed
+    down = min(max(down + PUSH_PART * (cells[0] * jump / 3.0), -most_down), most_down)
+    up = min(max(up + PUSH_PART * crossed, -most_up), most_up)
+    return lack + LACK_PART * (crossed - lack), down, up
+
+
+@njit(cache=True)
+def answer(crossed: Any, jump: Any, lack: Any, push: Any, cells: Any) -> None:
+    """Set what every group lacks (g,) and its momentum (2, g), and `crossed` (g,) to 0; `jump` (g, 2): of `jumps`."""
+    for g in range(len(lack)):
+        held = lack[g], push[0, g], push[1, g]
+        lack[g], push[0, g], push[1, g] = answered(crossed[g], jump[g, 0], jump[g, 1], held, cells)
+        crossed[g] = 0.0
 
 
 @njit(cache=True)

@@ -1,4 +1,4 @@
-"""The kernels of `vstent.flow.lattice.kernels.d3q19` for a GPU (numba-cuda), one thread per cell, link or group.
+"""The kernels of `d3q19` and `exchange` for a GPU (numba-cuda), one thread per cell, link or group.
 
 Arithmetic is the same; the functions of one cell, link or opening are shared. Sums have a fixed order, so that a GPU
 reproduces its results to the last bit. They differ from those of a CPU in the last bits, because the compilers fuse and
@@ -8,7 +8,8 @@ A pair of time steps is `drive`, `even_step` and `odd_step`. Walls and openings 
 sends along a link stays in the cell's own place for the opposite direction, where the next step reads it. A *near* link
 combines it with a population that arrives at the cell, when the next step reads it; any other link combines it with a
 population that leaves the cell, before it is stored. Only `keep` also writes the population sent to the mailbox, where
-the CPU has it after every odd step. After `defer` the populations are *at home*, that is, stored as on the CPU.
+the CPU has it after every odd step. After `defer` the populations are *at home*, that is, stored as on the CPU. Where
+levels exchange them, they must be.
 
 Import it only where a GPU is requested (`vstent.flow.lattice.gpu`).
 """
@@ -22,6 +23,8 @@ from numba import config, cuda, njit
 from vstent.flow.lattice.kernels import d3q19
 from vstent.flow.lattice.kernels.collision import collided, collided_screened, relaxed, rescaled, stress_size, thinned
 from vstent.flow.lattice.kernels.d3q19 import INFLOW, KIND, OPENING, OPPOSITE, PRESSURE, WANTED
+from vstent.flow.lattice.kernels.exchange import answered, converted, density_of
+from vstent.kernels.directions import VELOCITIES
 
 THREADS: Final = 8 if config.ENABLE_CUDASIM else 128
 """Number of threads per block; a power of 2. Numba simulates each by a thread of the processor, which is slow."""
@@ -51,7 +54,7 @@ LINE: Final = 32
 """Number of entries of 32 bits in a line of the memory. Every table begins on one; the limits are on the second."""
 HEAD: Final = LINE
 """Number of places kept for these entries."""
-_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+_ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _U, _WHOLE = np.uint64, np.uint32
 
 
@@ -365,7 +368,7 @@ def balance(integers: Any, singles: Any, part: float) -> None:
     g = cuda.grid(1)
     if g == 0:
         integers[AT_HOME] = 1
-    if g < integers[GROUPS]:
+    if g < integers[GROUPS] and part != 0:
         of_links = integers[integers[FIRST_LINK] :], integers[integers[GROUP_LINK] :]
         groups = *of_links, integers[integers[FIRST_MEMBER] :], integers[integers[GROUP_MEMBER] :]
         _balance(g, singles[integers[LOST] :], groups, singles[integers[REFILL] :], part)
@@ -489,3 +492,95 @@ def drive(f: Any, integers: Any, singles: Any, doubles: Any, stride: int, code_a
         if opening[KIND] == INFLOW:
             total /= integers[integers[COUNT] + k]
         doubles[integers[ANSWER] + k] = _answer(opening, total)
+
+
+_PUSH: Final = (3 * d3q19.WEIGHTS[:, None] * VELOCITIES).astype(np.float32)
+"""(19, 3) what momentum adds to the populations of a cell."""
+_zeros = _unrolled("zero", "zero")
+_plus = _unrolled("total, same, other, f", "total[{q}] + same * f[{q}] + other * f[{p}]")
+_pushed = _unrolled("f, x, y, z", "f[{q}] + (_PUSH[{q}, 0] * x + _PUSH[{q}, 1] * y + _PUSH[{q}, 2] * z)")
+
+
+@cuda.jit(cache=True)
+def take(f: Any, place: Any, group: Any, share: Any, held: Any) -> None:
+    """Take the mass that groups lack from cells beside the border (see `exchange.take`)."""
+    c = cuda.grid(1)
+    if c < place.size:
+        at = load(place, c)
+        store(f, at, load(f, at) - np.float32(share[c] * held[0, group[c]]))
+
+
+@cuda.jit(cache=True)
+def add_crossed(f: Any, address: Any, passed: Any, sign: int) -> None:
+    """Add what passes at links (l,) of borders in a step, from addresses (2, l); `sign`: 1 if it is even, else -1."""
+    k = cuda.grid(1)
+    if k < passed.size:
+        passed[k] += sign * float(load(f, address[0, k]) - load(f, address[1, k]))
+
+
+@cuda.jit(cache=True)
+def jumps(f: Any, stride: int, g: Any, new_stride: int, place: Any, finer: Any, part: float, found: Any) -> None:
+    """Write jump and speed (2, m) of the cells between (see `exchange.jumps`)."""
+    c = cuda.grid(1)
+    if c < place.size:
+        jump, speed = density_of(_loaded(f, _homes(stride, load(place, c))), part)
+        for n in range(finer.shape[0]):
+            density, _ = density_of(_loaded(g, _homes(new_stride, finer[n, c])), _ZERO)
+            jump -= density / np.float32(finer.shape[0])
+        found[0, c], found[1, c] = jump, speed
+
+
+@_inlined
+def _taken(values: Any, first: int, last: int, parts: Any, t: int) -> float:
+    """Return the sum of some values, which become 0; every thread of a block must call it."""
+    total = 0.0
+    for k in range(first + t, last, THREADS):
+        total += values[k]
+        values[k] = 0.0
+    result: float = _sum(parts, t, total)
+    return result
+
+
+@cuda.jit(cache=True)
+def answer(first: Any, passed: Any, passed_finer: Any, found: Any, held: Any, cells: Any, part: float) -> None:
+    """Set what groups lack and their momentum, from what passed on both grids and from `jumps`; one block per group.
+
+    `first` (3, g + 1) are the first link of every group on the finer and on the coarser grid, and its first cell
+    between. `part` is the volume of a finer cell over that of a coarser one.
+    """
+    g, t = cuda.blockIdx.x, cuda.threadIdx.x
+    parts = cuda.shared.array(THREADS, np.float64)
+    crossed = part * _taken(passed_finer, first[0, g], first[0, g + 1], parts, t)
+    crossed -= _taken(passed, first[1, g], first[1, g + 1], parts, t)
+    jump = _taken(found[0], first[2, g], first[2, g + 1], parts, t)
+    speed = _taken(found[1], first[2, g], first[2, g + 1], parts, t)
+    if t == 0:
+        lack, down, up = answered(crossed, jump, speed, (held[0, g], held[1, g], held[2, g]), cells)
+        held[0, g], held[1, g], held[2, g] = lack, down, up
+
+
+@cuda.jit(cache=True)
+def carry(
+    f: Any, stride: int, rates: Any, g: Any, new_stride: int, new_rates: Any, cells: Any, parts: Any, push: Any
+) -> None:
+    """Set populations of a grid by interpolation from those of another (see `exchange.carry`).
+
+    The first three arguments are populations, stride and singles of the source, the next three those of the target, and
+    the following two are from `on_gpu.stencil_of`.
+    """
+    i = cuda.grid(1)
+    if i >= cells.shape[1]:
+        return
+    total, (xx, yy, zz, xy, xz, yz) = _zeros(_ZERO), (_ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO)
+    for e in range(cells[2, i]):
+        even, odd, read = parts[5 + 2 * e, i], parts[6 + 2 * e, i], _loaded(f, _homes(stride, cells[3 + e, i]))
+        total = _plus(total, _HALF * (even + odd), _HALF * (even - odd), read)
+        u, v, w = _velocity(read)
+        x, y, z = np.float32(u), np.float32(v), np.float32(w)
+        xx, yy, zz = xx + even * (x * x), yy + even * (y * y), zz + even * (z * z)
+        xy, xz, yz = xy + even * (x * y), xz + even * (x * z), yz + even * (y * z)
+    more = np.float32(push[cells[1, i]])
+    pushed = _pushed(total, more * parts[1, i], more * parts[2, i], more * parts[3, i])
+    numbers = parts[4, i], rates[0], (rates[1], rates[2], rates[3], rates[4]), rates[5], new_rates[5]
+    new = converted(pushed, (xx, yy, zz, xy, xz, yz), parts[0, i], numbers)
+    _stored_swapped(g, _homes(new_stride, cells[0, i]), new)

@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 
-from vstent.flow.lattice.kernels import d3q19, lanes
+from vstent.flow.lattice.kernels import d3q19, exchange, lanes
 from vstent.kernels.first_use import ensure_cached
 
 
@@ -38,3 +38,11 @@ def flow() -> None:
     times = d3q19.relaxation_times(f, stride, none, relaxation[0], relaxation[1])
     d3q19.resisted(np.zeros((0, 3), np.float32), np.zeros((0, d3q19.ENTRY), np.float32), times, np.float32(1.0))
     d3q19.rescale(f, stride, none, links, np.float32(1.0), np.float32(1.0))
+    empty, one, column = np.zeros(0, np.float32), np.float32(1.0), np.zeros((0, 3), np.float32)
+    lack, push, group = np.zeros(1), np.zeros((2, 1)), none
+    stencil = none, nowhere, none, np.zeros((0, 2), np.float32), group, column
+    exchange.carry(f, stride, stencil, push[0], (f, stride, none, empty), (one, one, relaxation[1], one, one))
+    exchange.add_crossed(f, 0, np.zeros(2, np.int32), 1.0, lack)
+    jump = exchange.jumps(f, stride, f, stride, (none, np.zeros((0, 8), np.int32), group), one, 1)
+    exchange.answer(lack, jump, lack, push, (1.0, 1.0))
+    exchange.take(f, none, group, np.zeros(0), lack)
