@@ -101,6 +101,7 @@ def test_flows_on_several_grids_are_those_without_a_device(capsys: pytest.Captur
     [
         (["--engine", "nonsense"], "There is no 'nonsense'"),
         (["--engine", "openfoam", "--refine", "sac"], "does not support a finer grid"),
+        (["--engine", "openfoam", "--wires", "calibrated"], "leave out --wires calibrated"),
         (["--engine", "openfoam", "--gpu"], "does not support a GPU"),
     ],
 )

@@ -218,10 +218,12 @@ def engine_class(numerics: Numerics, *, is_pulsatile: bool) -> type[AbstractEngi
             f"The engine {numerics.engine} is incomplete: it lacks {', '.join(sorted(missing))}. Complete its package, "
             f"or choose the engine {LATTICE}."
         )
-    if numerics.refine and not engine.has_levels:
+    asked = {"--refine": numerics.refine, "--wires calibrated": numerics.wires == "calibrated"}
+    if any(asked.values()) and not engine.has_levels:
+        unsupported = " and ".join(option for option, is_asked in asked.items() if is_asked)
         raise InputError(
-            f"the engine {numerics.engine} does not support a finer grid in a part of the vessel: leave out --refine, "
-            f"or choose the engine {LATTICE}"
+            f"the engine {numerics.engine} does not support a finer grid in a part of the vessel: leave out "
+            f"{unsupported}, or choose the engine {LATTICE}"
         )
     if numerics.device_gpu and not engine.runs_on_gpu:
         raise InputError(
