@@ -276,6 +276,16 @@ def two_cycles(case: FlowCase, settings: FlowSettings) -> float:
     )
 
 
+def on_levels(cases: list[FlowCase], numerics: Numerics) -> None:
+    """Print the run times of flows on nested levels: with the sac refined, and with wires of the last case as walls."""
+    for name, case, changes in (
+        ("sac refined", cases[1], {"refine": ("sac",)}),
+        ("walls", cases[-1], {"wires": "resolved"}),
+    ):
+        one = replace(case, numerics=replace(numerics, **changes))
+        timed(name, STEADY_GOAL_S, lambda tell, one=one: (simulate_case(one, progress=tell),))
+
+
 def measures(field: FlowField, case: FlowCase) -> np.ndarray:
     """Neck inflow, sac velocity and wall shear stress of the sac; of a vessel without a sac, means over the vessel."""
     if case.sac is None:
@@ -416,6 +426,7 @@ def measured(surface: Path | None, extent: Extent) -> Found:
     else:
         found.steady_s = steady_s
         found.cycles_s = part("two cycles", lambda: two_cycles(cases[0], settings), NAN)
+        part("levels", lambda: on_levels(cases, replace(settings.numerics, device_gpu=True)), None)
     found.difference, found.same = part(
         "agreement with the processor",
         lambda: agreement(

@@ -206,7 +206,7 @@ if __name__ == "__main__":
     print("\n| | index | screen | struts | difference | left, screen | left, struts | whole screen to its part |")
     print(8 * "|---" + "|")
     for name, row in sorted(rows.items()):
-        for key in INDICES:
+        for key in row["screen"]:
             screen, struts = row["screen"][key], row["struts"][key]
             left = f"{row['left_with_screen'][key]:.3f} | {row['left_with_struts'][key]:.3f}"
             apart = f"{100 * (screen / struts - 1):+.1f} %"
