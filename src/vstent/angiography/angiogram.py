@@ -138,11 +138,16 @@ def angiogram(
 
     Parameters
     ----------
-    anatomy : the patient's vessel and aneurysms.
-    field : flow without or with a device, steady or pulsatile.
-    settings : injection, window and frame rate.
-    watch : takes the cell centers and edges and returns a function that is called with every frame (see `Watch`).
-    progress : called with the finished fraction.
+    anatomy : Anatomy
+        The patient's vessel and aneurysms.
+    field : FlowField
+        Flow without or with a device, steady or pulsatile.
+    settings : AngiogramSettings, optional
+        Injection, window and frame rate.
+    watch : callable, optional
+        Takes the cell centers and edges and returns a function that is called with every frame (see `Watch`).
+    progress : callable, optional
+        Called with the finished fraction.
 
     Raises
     ------

@@ -90,13 +90,19 @@ def deploy_coils(
 
     Parameters
     ----------
-    coil : the line of coils, or its key or name in the catalogue.
-    anatomy : the restored artery.
-    filling : packing density, volume of the coils over that of the sac, or the sizes of all coils in their order; None
-        is a density of 0.25.
-    inside : devices that are already in the artery; the coils stay outside them.
-    seed : number from which the places of the catheter and the turns of the framing coil are drawn.
-    progress : called after every coil with their number and the fraction of the length that has entered.
+    coil : Coil or str
+        The line of coils, or its key or name in the catalogue.
+    anatomy : Anatomy
+        The restored artery.
+    filling : float or sequence of Size, optional
+        Packing density, volume of the coils over that of the sac, or the sizes of all coils in their order; None is
+        a density of 0.25.
+    inside : sequence of Stent, optional
+        Devices that are already in the artery; the coils stay outside them.
+    seed : int, optional
+        Number from which the places of the catheter and the turns of the framing coil are drawn.
+    progress : callable, optional
+        Called after every coil with their number and the fraction of the length that has entered.
 
     Returns
     -------

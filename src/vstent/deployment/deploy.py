@@ -43,19 +43,27 @@ def deploy(  # noqa: PLR0913 one keyword for each thing that can be chosen
 
     Parameters
     ----------
-    design : the device, or its key or name in the catalogue.
-    anatomy : the restored artery.
-    size : size of the device; None proposes one.
-    landing : where the center, the proximal or the distal end lies. None centers the device on the neck of the largest
+    design : Design or str
+        The device, or its key or name in the catalogue.
+    anatomy : Anatomy
+        The restored artery.
+    size : Size, optional
+        Size of the device; None proposes one.
+    landing : Landing, optional
+        Where the center, the proximal or the distal end lies. None centers the device on the neck of the largest
         aneurysm, or as near to it as the ends of the artery allow. A basket is landed with its proximal end, at a
         height above the middle of the neck; None is 0.
-    method : ``constant_wire``, ``zhong2016`` (the contour of the paper alone), or a method with other weights.
-    compaction_fraction : fraction by which pushing shortens a braid relative to its natural length; negative when
-        pulled.
-    inside : devices that are already in the artery. Where they overlap, this device opens inside them (telescoping),
-        and it passes through a cell of those that lie on another path (a Y at a fork).
-    beside : names of the paths of devices side by side with this one; each gets its share of the artery (kissing).
-    progress : called after every iteration with its number and the fraction of nodes terminated.
+    method : AbstractMethod or str, optional
+        ``constant_wire``, ``zhong2016`` (the contour of the paper alone), or a method with other weights.
+    compaction_fraction : float, optional
+        Fraction by which pushing shortens a braid relative to its natural length; negative when pulled.
+    inside : sequence of Stent, optional
+        Devices that are already in the artery. Where they overlap, this device opens inside them (telescoping), and it
+        passes through a cell of those that lie on another path (a Y at a fork).
+    beside : sequence of str, optional
+        Names of the paths of devices side by side with this one; each gets its share of the artery (kissing).
+    progress : callable, optional
+        Called after every iteration with its number and the fraction of nodes terminated.
 
     Returns
     -------

@@ -29,8 +29,10 @@ def measure(anatomy: Anatomy, deployment: Deployment) -> Measures:
 
     Parameters
     ----------
-    anatomy : the artery; a device on another path is measured on that.
-    deployment : the deployed device.
+    anatomy : Anatomy
+        The artery; a device on another path is measured on that.
+    deployment : Deployment
+        The deployed device.
 
     Returns
     -------

@@ -156,13 +156,15 @@ def straighten(
 
     Parameters
     ----------
-    anatomy : the restored artery as scanned.
-    deployed : devices on one path, in the order of their deployment; each opens inside those before it. Coils follow
-        the sac.
-    setting : ``immediate`` or ``six_months`` after treatment; or what was measured: the angle by which the artery
-        opens, such as ``12deg``, or the radius of its sharpest bend afterwards, such as ``10.7mm``.
-    place : where the stiffness of the device relative to wall and bed lies in its range: -1 is the lowest, 1 the
-        highest.
+    anatomy : Anatomy
+        The restored artery as scanned.
+    deployed : sequence of Deployment
+        Devices on one path, in the order of their deployment; each opens inside those before it. Coils follow the sac.
+    setting : str, optional
+        ``immediate`` or ``six_months`` after treatment; or what was measured: the angle by which the artery opens, such
+        as ``12deg``, or the radius of its sharpest bend afterwards, such as ``10.7mm``.
+    place : float, optional
+        Where the stiffness of the device relative to wall and bed lies in its range: -1 is the lowest, 1 the highest.
 
     Returns
     -------

@@ -13,7 +13,12 @@ from vstent.errors import DeviceError
 
 @cache
 def catalogue() -> dict[str, Design]:
-    """Read all devices for arteries, by their key: those of the catalogue, of plug-ins and those added by the user.
+    """Read all devices for arteries: those of the catalogue, of plug-ins and those added by the user.
+
+    Returns
+    -------
+    dict
+        Designs by their key. The result is cached.
 
     Raises
     ------
@@ -117,7 +122,20 @@ def _check_new(added: Mapping[str, Design], known: Mapping[str, Design], source:
 def find_design(name: str) -> Design:
     """Find a device by its key or name, in upper or lower case.
 
-    A DeviceError, raised where there is none, lists all devices and suggests the most similar name.
+    Parameters
+    ----------
+    name : str
+        Key or name.
+
+    Returns
+    -------
+    Design
+        The device.
+
+    Raises
+    ------
+    DeviceError
+        There is no such device. The message lists all devices and suggests the most similar name.
     """
     designs = catalogue() | baskets()
     by_name = {word: design for design in designs.values() for word in called([design])}
@@ -148,5 +166,25 @@ def find_sizes(design: Design, *, diameter_mm: float | None = None, length_mm: f
 
 
 def find_size(design: Design, *, diameter_mm: float | None = None, length_mm: float | None = None) -> Size:
-    """Return the first of `find_sizes`, that is the smallest diameter with its shortest length; errors are the same."""
+    """Return the first of `find_sizes`, that is the smallest diameter with its shortest length.
+
+    Parameters
+    ----------
+    design : Design
+        The device.
+    diameter_mm : float, optional
+        Label diameter, in mm; None matches any.
+    length_mm : float, optional
+        Label length, in mm; None matches any.
+
+    Returns
+    -------
+    Size
+        The size.
+
+    Raises
+    ------
+    DeviceError
+        The device is not made in this size.
+    """
     return find_sizes(design, diameter_mm=diameter_mm, length_mm=length_mm)[0]

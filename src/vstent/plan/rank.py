@@ -118,12 +118,18 @@ def rank(
 
     Parameters
     ----------
-    anatomy : the restored artery.
-    designs : the devices. Every size of each is tried.
-    criteria : criteria for grading; None uses `default_criteria`.
-    shifts_mm : landing positions relative to the proposed one (centered on the neck), in mm, positive distally.
-    jobs : number of parallel processes.
-    progress : called with the number of finished candidates and the number of all.
+    anatomy : Anatomy
+        The restored artery.
+    designs : sequence of Design
+        The devices. Every size of each is tried.
+    criteria : Criteria, optional
+        Criteria for grading; None uses `default_criteria`.
+    shifts_mm : sequence of float, optional
+        Landing positions relative to the proposed one (centered on the neck), in mm, positive distally.
+    jobs : int, optional
+        Number of parallel processes.
+    progress : callable, optional
+        Called with the number of finished candidates and the number of all.
 
     Returns
     -------
