@@ -22,20 +22,11 @@ SIDES: Final = 12
 
 
 def struts(stent: Stent) -> Surface:
-    """Build one closed solid per wire by sweeping the wire's section along its axis.
+    """Build one closed solid per wire of a deployed device by sweeping the wire's section along its axis.
 
     A round wire becomes a prism of `SIDES` sides with the area of the circle. A laser-cut strut keeps its rectangular
-    section, with its thickness perpendicular to the wall. Open wires end in flat caps, and rings are closed.
-
-    Parameters
-    ----------
-    stent : Stent
-        The deployed device.
-
-    Returns
-    -------
-    Surface
-        Solids of all wires, with outward normals. No two wires share a vertex.
+    section, with its thickness perpendicular to the wall. Open wires end in flat caps, and rings are closed. Normals
+    point outward, and no two wires share a vertex.
     """
     points_mm, first, last = stent.wire_points_mm, stent.wire_starts[:-1], stent.wire_starts[1:] - 1
     is_joined = np.all(np.abs(points_mm[first] - points_mm[last]) < 1e-9, axis=1)
