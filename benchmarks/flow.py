@@ -4,7 +4,7 @@ Usage: python benchmarks/flow.py [--cost] [--pulse] [SURFACE] [CELL_MM ...]
 
 Besides: how a step's time grows with its cells, and what other machines would need (computed). Seconds of the clock
 depend on what else the machine does: processor seconds stand beside them. With ``--cost`` the demo is computed, steady,
-bare and with Silk and Enterprise as screens, in cells of 0.1 mm, all over and then in the sac and near it only
+bare and with Silk and Enterprise as screens, in cells of 0.1 mm, all over and then only in and near the sac
 (`Numerics.refine`). With ``--pulse`` it is computed bare for two cycles of a pulse, in both ways. With a surface
 file, in mm, that artery is, in the latter way alone.
 """
@@ -152,7 +152,7 @@ def tell(now: Progress) -> None:
 def named(surface: Path | None, *, refine: tuple[Region, ...]) -> str:
     """What is computed, in words."""
     name = "demo" if surface is None else surface.stem
-    return f"{name}, cells of 0.1 mm{' in the sac and near it' if refine else ''}"
+    return f"{name}, cells of 0.1 mm{' in and near the sac' if refine else ''}"
 
 
 def table(case: FlowCase, fields: dict[str, FlowField], clock_s: float, core_s: float) -> None:

@@ -258,7 +258,9 @@ def _of_sac_wall(field: FlowField, sac: Surface, ostium: Surface) -> dict[str, f
 
 def on_sac(wall: Surface, sac: Surface, ostium: Surface) -> Bools:
     """Return which vertices (v,) of the wall belong to a sac: they lie on its surface, and not on the neck's rim."""
-    return (sac.closest(wall.vertices_mm)[1] < ON_SAC_MM) & (ostium.closest(wall.vertices_mm)[1] > RIM_MM)
+    is_sac = np.asarray(sac.closest(wall.vertices_mm)[1] < ON_SAC_MM)
+    is_sac[is_sac] = ostium.closest(wall.vertices_mm[is_sac])[1] > RIM_MM
+    return is_sac
 
 
 def vertex_areas_mm2(surface: Surface) -> Floats:
