@@ -111,11 +111,7 @@ def pipeline() -> list[Row]:
             "65-70 %",
             f"{', '.join(f'{100 - one:.0f}' for one in cover)} % ({listed})",
         ),
-        (
-            "Pipeline: pores per mm² (same source)",
-            "12.5-20",
-            f"{', '.join(f'{one:.1f}' for one in pores)} ({listed})",
-        ),
+        ("Pipeline: pores per mm² (same source)", "12.5-20", f"{', '.join(f'{one:.1f}' for one in pores)} ({listed})"),
     ]
 
 

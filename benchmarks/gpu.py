@@ -269,11 +269,7 @@ def two_cycles(case: FlowCase, settings: FlowSettings) -> float:
     """Print and return the run time of two cycles, set-up included."""
     numerics = replace(settings.numerics, device_gpu=True, max_cycles=2)
     pulse = replace(case, waveform=OLDER_ADULT_ICA, numerics=numerics)
-    return timed(
-        "two cycles, bare",
-        CYCLES_GOAL_S,
-        lambda tell: (simulate_case(pulse, progress=tell),),
-    )
+    return timed("two cycles, bare", CYCLES_GOAL_S, lambda tell: (simulate_case(pulse, progress=tell),))
 
 
 def on_levels(cases: list[FlowCase], numerics: Numerics) -> None:
@@ -410,9 +406,7 @@ def measured(surface: Path | None, extent: Extent) -> Found:
     is_tiny, settings, found = extent is TINY, extent.settings, Found()
     in_place = part("bandwidth", lambda: bandwidths(extent), NAN)
     cases = part(
-        "artery and devices",
-        lambda: tiny_cases(settings) if is_tiny else cases_of(anatomy_of(surface), settings),
-        [],
+        "artery and devices", lambda: tiny_cases(settings) if is_tiny else cases_of(anatomy_of(surface), settings), []
     )
     if not cases:
         return found

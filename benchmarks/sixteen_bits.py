@@ -177,12 +177,7 @@ CASES = {
     "pulse": lambda: demo(0.3, 2 * PHASES, pulse=True),
     "nozzle": jet,
 }
-FORMATS = {
-    "32 bits": (None, False),
-    "FP16S": (FP16S, False),
-    "FP16C": (FP16C, False),
-    "FP16C shifted": (FP16C, True),
-}
+FORMATS = {"32 bits": (None, False), "FP16S": (FP16S, False), "FP16C": (FP16C, False), "FP16C shifted": (FP16C, True)}
 
 
 def main(names: list[str]) -> None:

@@ -186,11 +186,7 @@ def compare(name: str) -> None:
 
 
 def show(
-    name: str,
-    device: str,
-    case: FlowCase,
-    known: FlowField,
-    ways: dict[str, Callable[[], tuple[float, FlowField]]],
+    name: str, device: str, case: FlowCase, known: FlowField, ways: dict[str, Callable[[], tuple[float, FlowField]]]
 ) -> None:
     """Print the rows of one flow."""
     _, reference = direct(replace(case, numerics=replace(case.numerics, tolerance=REFERENCE)), known)

@@ -28,14 +28,7 @@ from vstent.phantoms import Scanner
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "helpers"))
 from published_necks import Compared, compared, patients
-from sac_truth import (
-    GLUED,
-    anatomy_of,
-    beside_the_fork_without_sac,
-    moved_mm,
-    relative_errors,
-    scanned_anatomy_of,
-)
+from sac_truth import GLUED, anatomy_of, beside_the_fork_without_sac, moved_mm, relative_errors, scanned_anatomy_of
 from vessel_truth import NAMES, PHANTOMS, halved, large_scan, reference_errors, trace_errors, traced, wall_errors
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"

@@ -12,13 +12,7 @@ author = "The vstent developers"
 copyright = "The vstent developers. Research use only: not cleared for diagnosis or treatment."
 version = release = version_of("vstent")
 
-extensions = [
-    "sphinx.ext.autodoc",
-    "sphinx.ext.napoleon",
-    "sphinx.ext.mathjax",
-    "sphinx_gallery.gen_gallery",
-    "pages",
-]
+extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax", "sphinx_gallery.gen_gallery", "pages"]
 exclude_patterns = ["_build", "recorded", "generated/*.inc", "gallery"]
 html_theme = "furo"
 html_title = "vstent"

@@ -3,15 +3,7 @@
 import numpy as np
 import pytest
 
-from vstent.angiography.film import (
-    PAPER,
-    WIRE_PER_MM,
-    film_of,
-    iodine_cm2_g,
-    levels_of,
-    window_of,
-    wire_shadow,
-)
+from vstent.angiography.film import PAPER, WIRE_PER_MM, film_of, iodine_cm2_g, levels_of, window_of, wire_shadow
 from vstent.angiography.projection import projector_of
 from vstent.angiography.view import View, angles_of, fitted
 from vstent.devices.catalogue import find_design

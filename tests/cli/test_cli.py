@@ -55,12 +55,7 @@ BAD = {
     "a volume without shape": ("scan.raw", bytes(4096), ["--spacing", "0.4"], "shape"),
     "a volume of zeros": ("scan.raw", bytes(4096), ["--shape", "16,16,16", "--spacing", "0.4"], "lumen"),
     "a waveform of one column": ("pulse.csv", b"0\n1\n", ["--pulsatile", "FILE"], "line 1"),
-    "a pulse that runs back": (
-        "pulse.csv",
-        b"0,1\n2,1\n1,1\n3,1\n4,1",
-        ["--pulsatile", "FILE"],
-        "do not increase",
-    ),
+    "a pulse that runs back": ("pulse.csv", b"0,1\n2,1\n1,1\n3,1\n4,1", ["--pulsatile", "FILE"], "do not increase"),
     "a pulse in milliseconds": (
         "pulse.csv",
         b"ms,flow\n0,1\n200,3\n400,2\n600,1.5\n800,1.2\n1000,1\n",
@@ -327,8 +322,7 @@ def test_ports_that_do_not_exist_are_refused(port: str, capsys: pytest.CaptureFi
 
 
 @pytest.mark.parametrize(
-    "command",
-    [["run", "none.json", "--out", "out"], ["rank", "a.stl", "--out", "out", "--criteria", "none.toml"]],
+    "command", [["run", "none.json", "--out", "out"], ["rank", "a.stl", "--out", "out", "--criteria", "none.toml"]]
 )
 def test_files_besides_the_scan_are_told_where_they_are_missing(
     command: list[str], capsys: pytest.CaptureFixture[str]

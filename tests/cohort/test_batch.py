@@ -21,16 +21,7 @@ from stated import NECK, OUTLETS, STATED, needed
 from vstent import phantoms
 from vstent.cli import main
 from vstent.cohort import batch
-from vstent.cohort.batch import (
-    COST,
-    LOST,
-    collect,
-    flat_metrics,
-    left_to_do,
-    read_rows,
-    run_cohort,
-    work,
-)
+from vstent.cohort.batch import COST, LOST, collect, flat_metrics, left_to_do, read_rows, run_cohort, work
 from vstent.cohort.cases import COLUMNS, find_cases
 from vstent.cohort.estimate import START_CPU_S, estimate
 from vstent.devices.treatment import with_device
@@ -193,11 +184,7 @@ def test_a_second_run_does_only_what_is_missing(scans, table, tmp_path):
     treatments = (*TREATMENTS, with_device("pipeline"))
     more = [replace(c, settings=replace(c.settings, treatments=treatments)) for c in changed]
     missing = {task.case.name: task.case.settings.devices for task in left_to_do(more, tmp_path)}
-    assert missing == {
-        "a": ("leo", "pipeline"),
-        "b": ("leo", "enterprise", "pipeline"),
-        "c": ("pipeline",),
-    }
+    assert missing == {"a": ("leo", "pipeline"), "b": ("leo", "enterprise", "pipeline"), "c": ("pipeline",)}
     # another threshold is another study
     other = [replace(cases[0], settings=replace(SETTINGS, input=InputSettings("mm", threshold=100.0)))]
     assert left_to_do(other, tmp_path)[0].case.settings.devices == SETTINGS.devices

@@ -15,10 +15,7 @@ from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.problem import vessel_case
 from vstent.flow.settings import FlowSettings, Numerics
 
-HERE, GPU = (
-    Numerics(cell_size_mm=0.3),
-    Numerics(cell_size_mm=0.3, device_gpu=True),
-)
+HERE, GPU = (Numerics(cell_size_mm=0.3), Numerics(cell_size_mm=0.3, device_gpu=True))
 LONG_S = 20.0
 
 

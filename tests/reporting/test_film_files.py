@@ -10,16 +10,7 @@ from PIL import Image
 from vstent.angiography.curves import Curves
 from vstent.angiography.film import PAPER, Film
 from vstent.angiography.view import View, angles_of
-from vstent.reporting.films import (
-    CAPTION_PX,
-    GAP_PX,
-    Shown,
-    beside,
-    kept_films,
-    key_frames,
-    key_times_s,
-    write_films,
-)
+from vstent.reporting.films import CAPTION_PX, GAP_PX, Shown, beside, kept_films, key_frames, key_times_s, write_films
 
 VIEW = View(*angles_of("RAO 30 CRA 20"), np.zeros(3), 32, 48)
 

@@ -223,14 +223,8 @@ def test_settings_of_another_version_are_refused(path):
 @pytest.mark.parametrize(
     ("length_mm", "told"),
     [
-        (
-            11.0,
-            "1 of 2 metrics differ, treatments.silk.b_mm most (relative difference 0.091, more than the 0.001",
-        ),
-        (
-            10.005,
-            "1 of 2 metrics differ, treatments.silk.b_mm most (relative difference 0.0005, within the 0.001",
-        ),
+        (11.0, "1 of 2 metrics differ, treatments.silk.b_mm most (relative difference 0.091, more than the 0.001"),
+        (10.005, "1 of 2 metrics differ, treatments.silk.b_mm most (relative difference 0.0005, within the 0.001"),
         (10.0 + 1e-12, "The metrics agree except for rounding."),
         (10.0, "The metrics are identical to the last bit."),
     ],

@@ -64,11 +64,7 @@ class _Way(NamedTuple):
 
 
 def trim(
-    vessel: Vessel,
-    *,
-    at_mm: Floats | None = None,
-    upstream_mm: float | None = None,
-    downstream_mm: float | None = None,
+    vessel: Vessel, *, at_mm: Floats | None = None, upstream_mm: float | None = None, downstream_mm: float | None = None
 ) -> Vessel:
     """Trim a traced vessel around its largest sac, and trace it again.
 

@@ -24,12 +24,7 @@ MARGIN: Final = 1.12
 """Width of the detector relative to the shadow of what it shows."""
 _PRIMARY_DEG: Final = {"LAO": 1.0, "RAO": -1.0}
 _SECONDARY_DEG: Final = {"CRA": 1.0, "CAU": -1.0}
-_NAMED: Final = {
-    "AP": (0.0, 0.0),
-    "PA": (0.0, 0.0),
-    "FRONTAL": (0.0, 0.0),
-    "LATERAL": (np.pi / 2, 0.0),
-}
+_NAMED: Final = {"AP": (0.0, 0.0), "PA": (0.0, 0.0), "FRONTAL": (0.0, 0.0), "LATERAL": (np.pi / 2, 0.0)}
 """Directions with a name: primary and secondary angle in radians."""
 
 

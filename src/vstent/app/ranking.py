@@ -35,10 +35,7 @@ COLUMNS: Final = {
     "neck_inflow_change_fraction": ("Neck inflow", "Change of the neck inflow against the flow without a device."),
     "sac_velocity_change_fraction": ("Sac velocity", "Change of the mean sac velocity against no device."),
     "sac_wss_change_fraction": ("Sac shear", "Change of the mean wall shear stress on the sac against no device."),
-    "flow_uncertainty_fraction": (
-        "still moving by",
-        "Part by which the flow would still change; not its error.",
-    ),
+    "flow_uncertainty_fraction": ("still moving by", "Part by which the flow would still change; not its error."),
     "flow_grade": ("Grade", "Grade of the flow: good, fair or not usable."),
 }
 """Heading and meaning of every column of measures; an empty meaning is that of `DEFINITIONS`."""

@@ -282,11 +282,7 @@ def _add_input(api: APIRouter, work: Workspace, of_case: Any) -> None:
 
     @api.get("/api/cases/{case_id}/image/slice", summary="One slice of the scan, or the maximum of a slab (binary)")
     def one_slice(
-        axis: Axis,
-        index: int,
-        slab: Annotated[int, Query(ge=0)] = 0,
-        upright: bool = False,
-        case: Case = of_case,
+        axis: Axis, index: int, slab: Annotated[int, Query(ge=0)] = 0, upright: bool = False, case: Case = of_case
     ) -> Response:
         return Binary(work.scan(case).slice(axis, index, slab, is_upright=upright))
 

@@ -31,10 +31,7 @@ USUAL: Final = {"angle": 0.1, MARGIN: 0.15, LENGTH: 0.5, "um": 0.15}
 """Smallest standard errors of priors, because devices differ by more than the range of one: rad, mm, mm, and a
 fraction of a width."""
 NEEDED: Final = {
-    "braid_angle_rad": (
-        "the braid angle",
-        "Add the free length, and the length in tubes of other diameters",
-    ),
+    "braid_angle_rad": ("the braid angle", "Add the free length, and the length in tubes of other diameters"),
     "cell_angle_rad": (
         "the cell angle",
         "Add the angle, or length and width of a cell, or lengths in tubes of other diameters",

@@ -223,9 +223,7 @@ def read_treatment(text: str) -> Treatment:
                 float(diameter) if diameter else None,
                 float(length) if length else None,
                 Placing(
-                    path or Placing.path,
-                    shift_mm=0.0 if shift in (None, FORK) else float(shift),
-                    at_fork=shift == FORK,
+                    path or Placing.path, shift_mm=0.0 if shift in (None, FORK) else float(shift), at_fork=shift == FORK
                 ),
                 tuple(one.id for one in implants) if sign == NESTED else (),
                 float(density) / 100 if density else None,

@@ -125,10 +125,7 @@ def turned(case: FlowCase, turn: Rotation) -> FlowCase:
 
 
 def convergence(
-    case: FlowCase,
-    *,
-    folder: Path | None = None,
-    told: Callable[[float, str], None] = lambda fraction, sentence: None,
+    case: FlowCase, *, folder: Path | None = None, told: Callable[[float, str], None] = lambda fraction, sentence: None
 ) -> Sensitivity:
     """Compute a flow with three grid spacings, three values of every other numerical setting, and in three positions.
 

@@ -30,13 +30,7 @@ ON_SAC_MM: Final = 0.02
 RIM_MM: Final = 0.05
 """Distance from the neck within which wall counts as the artery's. No grid tells both apart there, and behind a dense
 braid the artery's shear stress on such a rim would exceed that of the whole sac."""
-QUANTITIES: Final = (
-    "neck_inflow_mL_s",
-    "mean_sac_velocity_m_s",
-    "mean_sac_wss_Pa",
-    "mean_wss_Pa",
-    "pressure_drop_Pa",
-)
+QUANTITIES: Final = ("neck_inflow_mL_s", "mean_sac_velocity_m_s", "mean_sac_wss_Pa", "mean_wss_Pa", "pressure_drop_Pa")
 """Indices compared between grids, as far as the vessel has them."""
 
 

@@ -157,11 +157,7 @@ def _near(boxes: Any, t: Any, reach: float, near: Any, number: Any) -> int:
 @njit(cache=True)
 def _middle(t: Any) -> tuple[float, float, float]:
     """Return the centroid of a triangle."""
-    return (
-        (t[0, 0] + t[1, 0] + t[2, 0]) / 3,
-        (t[0, 1] + t[1, 1] + t[2, 1]) / 3,
-        (t[0, 2] + t[1, 2] + t[2, 2]) / 3,
-    )
+    return ((t[0, 0] + t[1, 0] + t[2, 0]) / 3, (t[0, 1] + t[1, 1] + t[2, 1]) / 3, (t[0, 2] + t[1, 2] + t[2, 2]) / 3)
 
 
 @njit(cache=True)

@@ -43,12 +43,7 @@ OF_PULSE: Final = (
 )
 """Note on all flow metrics of a pulsatile flow."""
 
-WANTED: Final = {
-    "neck_inflow_mL_s": -1,
-    "mean_sac_velocity_m_s": -1,
-    "sac_kinetic_energy_J": -1,
-    "turnover_time_s": 1,
-}
+WANTED: Final = {"neck_inflow_mL_s": -1, "mean_sac_velocity_m_s": -1, "sac_kinetic_energy_J": -1, "turnover_time_s": 1}
 """Sign of the wanted change of a flow metric. Less and slower inflow is associated with occlusion; for other metrics
 no direction is agreed on."""
 HEADLINES: Final = (

@@ -90,12 +90,7 @@ class CaseResult(Computed):
 
 
 def run(
-    path: Path | str,
-    out: Path | str,
-    settings: Settings,
-    progress: OnProgress = silent,
-    *,
-    replaces: bool = False,
+    path: Path | str, out: Path | str, settings: Settings, progress: OnProgress = silent, *, replaces: bool = False
 ) -> CaseResult:
     """Run one study and write its folder; a study that was stopped there resumes.
 

@@ -347,13 +347,7 @@ def test_launches_are_recorded_once_and_replayed(monkeypatch: pytest.MonkeyPatch
     driver = Driver()
     replay = record(driver, monkeypatch, lambda: driver.calls.append("kernels"))
     names = [call if isinstance(call, str) else call[0] for call in driver.calls]
-    assert names == [
-        "cuStreamBeginCapture",
-        "kernels",
-        "cuStreamEndCapture",
-        "cuGraphInstantiate",
-        "cuGraphDestroy",
-    ]
+    assert names == ["cuStreamBeginCapture", "kernels", "cuStreamEndCapture", "cuGraphInstantiate", "cuGraphDestroy"]
     del driver.calls[:]
     for _ in range(2):
         replay()

@@ -100,12 +100,7 @@ def joined(state: State, flows: Sequence[Reading]) -> Reading:
 
 
 def field_of(
-    state: State,
-    flows: Sequence[Reading],
-    outcome: Outcome,
-    left: float,
-    advice: str,
-    phases: tuple[Phase, ...] = (),
+    state: State, flows: Sequence[Reading], outcome: Outcome, left: float, advice: str, phases: tuple[Phase, ...] = ()
 ) -> FlowField:
     """Return the flow field of a run from the flow on the levels kept, and on finer ones for the values at the wall."""
     vessel, flow, finest = state.case.vessel, joined(state, flows), state.at_wires

@@ -49,11 +49,7 @@ def solution() -> str:
             "U": velocity,
             "UFinal": velocity | {"relTol": 0},
         },
-        "SIMPLE": {
-            "consistent": True,
-            "nNonOrthogonalCorrectors": 1,
-            "residualControl": {"p": 1e-5, "U": 1e-5},
-        },
+        "SIMPLE": {"consistent": True, "nNonOrthogonalCorrectors": 1, "residualControl": {"p": 1e-5, "U": 1e-5}},
         "PIMPLE": {"nOuterCorrectors": 1, "nCorrectors": 2, "nNonOrthogonalCorrectors": 1},
         "potentialFlow": {"nNonOrthogonalCorrectors": 5},
         "relaxationFactors": {"equations": {"U": 0.9, "UFinal": 1}},

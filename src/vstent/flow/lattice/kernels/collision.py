@@ -337,11 +337,7 @@ def collided_screened(f: Any, time: Any, limit: Any, odd_rate: Any, normal: Any,
         xz + x * fz + z * fx,
         yz + y * fz + z * fy,
     )
-    momentum = (
-        rate * x + half_odd * force[0],
-        rate * y + half_odd * force[1],
-        rate * z + half_odd * force[2],
-    )
+    momentum = (rate * x + half_odd * force[0], rate * y + half_odd * force[1], rate * z + half_odd * force[2])
     trace = pushed[0] + pushed[1] + pushed[2]
     odd = _odd(momentum, _third(u, n, keep - (_ONE - rate)))
     return _even(density, u, pushed, trace), odd, _HALF * (_ONE - rate)

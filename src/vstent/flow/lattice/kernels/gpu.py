@@ -141,8 +141,7 @@ _stored = _unrolled("f, at, new", "store(f, at[{q}], new[{q}])")
 _stored_swapped = _unrolled("f, at, new", "store(f, at[{q}], new[{p}])")
 # Addresses are computed again, because registers that hold them would be too few for the collision.
 _stored_away = _unrolled(
-    "f, stride, integers, s, cell, links, new",
-    "store(f, _away({q}, stride, integers, s, cell, links), new[{q}])",
+    "f, stride, integers, s, cell, links, new", "store(f, _away({q}, stride, integers, s, cell, links), new[{q}])"
 )
 
 
