@@ -23,6 +23,8 @@ _CHUNK: Final = 256
 """Number of target cells for which a thread uses the same scratch memory."""
 _STARTS: Final = tuple(range(0, _EVEN, lanes.COUNT))
 """First of the values in each vector register that holds those of either part."""
+_ACROSS: Final = tuple(range(0, _VALUES * lanes.COUNT, lanes.COUNT))
+"""First of these values of as many cells as a vector register holds."""
 LACK_PART: Final = 0.15
 """Under-relaxation factor with which the mass returned to the coarser level follows what crossed."""
 PUSH_PART: Final = 0.05
@@ -61,13 +63,23 @@ _plus: Final = njit(cache=True, forceinline=True)(_plus_one if len(_STARTS) == 1
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
-def converted(held: Any, squares: Any, limit: Any, numbers: Any) -> tuple[Any, ...]:
-    """Return populations as on a grid of another spacing (see `collision.carried`); `numbers` as in `carry`."""
-    ratio, time, law, odd_rate, new_odd_rate = numbers
-    if law[0] > 0.0:
-        time = np.float32(thinned(stress_size(held), time, law))
+def converted(held: Any, squares: Any, time: Any, limit: Any, numbers: Any) -> tuple[Any, ...]:
+    """Return populations as on a grid of another spacing (see `collision.carried`).
+
+    `time` is the relaxation time of the source; `numbers` are those of `carry` without it and its law.
+    """
+    ratio, odd_rate, new_odd_rate = numbers
     new_time = _HALF + (time - _HALF) / ratio
     return carried(held, squares, ratio, (time, limit, odd_rate), (new_time, limit, new_odd_rate))
+
+
+@njit(cache=True, forceinline=True, error_model="numpy")
+def _joined(v: Any) -> tuple[Any, ...]:
+    """Return the 19 populations of what `_split` writes."""
+    first = v[0], v[1] + v[16], v[1] - v[16], v[2] + v[17], v[2] - v[17], v[3] + v[18], v[3] - v[18]
+    second = v[4] + v[19], v[4] - v[19], v[5] + v[20], v[5] - v[20], v[6] + v[21], v[6] - v[21]
+    third = v[7] + v[22], v[7] - v[22], v[8] + v[23], v[8] - v[23], v[9] + v[24], v[9] - v[24]
+    return first + second + third
 
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
@@ -89,30 +101,44 @@ def carry(f: Any, stride: int, stencil: Any, push: Any, into: Any, numbers: Any)
     """
     place, start, cell, weight, group, part = stencil
     g, new_stride, new_place, limit = into
+    ratio, time, law, odd_rate, new_odd_rate = numbers
     read = np.zeros((len(place) + 1) * _VALUES, np.float32)
     for c in prange(len(place)):
         _split(f, stride, place[c], read[c * _VALUES : (c + 1) * _VALUES])
     for chunk in prange((len(new_place) + _CHUNK - 1) // _CHUNK):
-        values, held = np.zeros(_VALUES, np.float32), np.zeros(19, np.float32)
-        for i in range(_CHUNK * chunk, min(_CHUNK * chunk + _CHUNK, len(new_place))):
-            even = odd_part = lanes.gather(read, _STARTS, len(place) * _VALUES)  # zeros
-            for e in range(start[i], start[i + 1]):
-                at = cell[e] * _VALUES
-                even = _plus(even, weight[e, 0], lanes.gather(read, _STARTS, at))
-                odd_part = _plus(odd_part, weight[e, 1], lanes.gather(read, _STARTS, at + _EVEN))
-            lanes.scatter(values, _STARTS, 0, even, lanes.COUNT)
-            lanes.scatter(values, _STARTS, _EVEN, odd_part, lanes.COUNT)
-            held[0] = values[0]
-            x, y, z = part[i]
-            for k in range(9):
-                c = _AXES[2 * k + 1]
-                along = push[group[i]] * (c[0] * x + c[1] * y + c[2] * z) / (6.0 if k < 3 else 12.0)
-                odd = values[_EVEN + k] + np.float32(along)
-                held[2 * k + 1], held[2 * k + 2] = values[1 + k] + odd, values[1 + k] - odd
-            squares = values[10], values[11], values[12], values[13], values[14], values[15]
-            new = converted(held, squares, limit[i], numbers)
+        values, across = np.zeros(_VALUES, np.float32), np.zeros(_VALUES * lanes.COUNT, np.float32)
+        limits, times = np.zeros(lanes.COUNT, np.float32), np.full(lanes.COUNT, time, np.float32)
+        for begin in range(_CHUNK * chunk, min(_CHUNK * chunk + _CHUNK, len(new_place)), lanes.COUNT):
+            cells = min(lanes.COUNT, len(new_place) - begin)
+            for j in range(cells):
+                i = begin + j
+                limits[j] = limit[i]
+                even = odd = lanes.gather(read, _STARTS, len(place) * _VALUES)  # zeros
+                for e in range(start[i], start[i + 1]):
+                    at = cell[e] * _VALUES
+                    even = _plus(even, weight[e, 0], lanes.gather(read, _STARTS, at))
+                    odd = _plus(odd, weight[e, 1], lanes.gather(read, _STARTS, at + _EVEN))
+                lanes.scatter(values, _STARTS, 0, even, lanes.COUNT)
+                lanes.scatter(values, _STARTS, _EVEN, odd, lanes.COUNT)
+                x, y, z = part[i]
+                for k in range(9):
+                    c = _AXES[2 * k + 1]
+                    along = push[group[i]] * (c[0] * x + c[1] * y + c[2] * z) / (6.0 if k < 3 else 12.0)
+                    values[_EVEN + k] += np.float32(along)
+                for k in range(_VALUES):
+                    across[k * lanes.COUNT + j] = values[k]
+            moved = lanes.gather(across, _ACROSS, 0)
+            held = _joined(moved)
+            if law[0] > 0.0:
+                lanes.scatter(times, (0,), 0, (stress_size(held),), lanes.COUNT)
+                for j in range(cells):
+                    times[j] = thinned(times[j], time, law)
+            own = lanes.load(times, 0), lanes.load(limits, 0)
+            new = converted(held, moved[10:16], *own, (ratio, odd_rate, new_odd_rate))
+            lanes.scatter(across, _ACROSS[:19], 0, new, lanes.COUNT)
             for q in range(19):
-                g[OPPOSITE[q] * new_stride + new_place[i]] = new[q]
+                for j in range(cells):
+                    g[OPPOSITE[q] * new_stride + new_place[begin + j]] = across[q * lanes.COUNT + j]
 
 
 @njit(cache=True, parallel=True)

@@ -580,6 +580,8 @@ def carry(
         xy, xz, yz = xy + even * (x * y), xz + even * (x * z), yz + even * (y * z)
     more = np.float32(push[cells[1, i]])
     pushed = _pushed(total, more * parts[1, i], more * parts[2, i], more * parts[3, i])
-    numbers = parts[4, i], rates[0], (rates[1], rates[2], rates[3], rates[4]), rates[5], new_rates[5]
-    new = converted(pushed, (xx, yy, zz, xy, xz, yz), parts[0, i], numbers)
+    time, law = rates[0], (rates[1], rates[2], rates[3], rates[4])
+    if law[0] > _ZERO:
+        time = np.float32(thinned(stress_size(pushed), time, law))
+    new = converted(pushed, (xx, yy, zz, xy, xz, yz), time, parts[0, i], (parts[4, i], rates[5], new_rates[5]))
     _stored_swapped(g, _homes(new_stride, cells[0, i]), new)
