@@ -7,17 +7,18 @@ import pytest
 from small_neck import covered
 
 import vstent
-from vstent.deployment.struts import united
+from vstent.deployment.struts import struts, united
 from vstent.flow import domain, simulation
 from vstent.flow.case import FlowCase
 from vstent.flow.indices import indices
-from vstent.flow.lattice import stepping
+from vstent.flow.lattice import levels, stepping
 from vstent.flow.lattice.cost import estimate
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.reading import exchanged, force_N
 from vstent.flow.lattice.state import State
 from vstent.flow.settings import FlowSettings, Numerics
 from vstent.flow.simulation import simulate_case
+from vstent.geometry.surface import Surface
 from vstent.kernels.arrays import Floats
 from vstent.units import duration
 
@@ -92,6 +93,22 @@ def test_wires_too_thin_for_the_grid_are_walls_on_a_finer_level(resolved: FlowCa
     made, foretold = sum(len(level.domain.cells) for level in state.levels), estimate(case).cells
     assert made == pytest.approx(foretold, rel=0.25)
     assert state.kept == (state,)
+
+
+def test_walls_of_a_device_beside_a_neck_are_those_of_its_side_that_faces_it(resolved: FlowCase) -> None:
+    over_neck = resolved.solids[0]
+    middle_mm = resolved.vessel.centerlines[0].points_mm.mean(axis=0)
+    turned_mm = (over_neck.wire_points_mm - middle_mm) * (-1.0, -1.0, 1.0) + middle_mm
+    both = replace(resolved, solids=(over_neck, replace(over_neck, wire_points_mm=turned_mm)))
+    assert resolved.target is not None
+    parts = (resolved.target.sac, resolved.target.ostium)
+    sac, ostium = (Surface(one.vertices_mm + np.array([1.5, 0.0, 0.0]), one.faces) for one in parts)
+    beside = [
+        levels._around(replace(case, target=replace(resolved.target, sac=sac, ostium=ostium)))
+        for case in (resolved, both)
+    ]
+    assert beside[0].area_mm2 > 0.5 * struts(over_neck).area_mm2
+    assert beside[1].area_mm2 == pytest.approx(beside[0].area_mm2)
 
 
 @pytest.mark.parametrize(("finer", "most"), [(1, 0.01), (2, 0.07)])

@@ -246,17 +246,20 @@ def _reach_mm(case: FlowCase, size_mm: float, finest_mm: float) -> float:
 def _around(case: FlowCase) -> Surface:
     """Return what finer levels lie around: a neck with a screen, or wires that are walls.
 
-    Walls are the wires in the sac and near its neck, or simply all if none are. The neck is the same for all devices in
-    a vessel, which share the grids.
+    Walls are the wires in the sac and near its neck. Where a device passes a neck at a fork at a distance, they are
+    those of its side that faces the neck. The neck is the same for all devices in a vessel, which share the grids.
     """
     if case.has_screen:
         assert case.ostium is not None
         return case.ostium
     assert case.wires is not None
-    if case.sac is None:
+    if case.sac is None or case.ostium is None:
         return case.wires
-    is_near = case.sac.signed_distance(case.wires.corners_mm.mean(axis=1)) < BESIDE_NECK * thickness_mm(case.wires)
-    return Surface(case.wires.vertices_mm, case.wires.faces[is_near]) if is_near.any() else case.wires
+    away_mm = case.sac.signed_distance(case.wires.corners_mm.mean(axis=1))
+    reach_mm = BESIDE_NECK * thickness_mm(case.wires)
+    if away_mm.min() > reach_mm:
+        reach_mm = away_mm.min() + 0.5 * neck_diameter_mm(case.ostium)
+    return Surface(case.wires.vertices_mm, case.wires.faces[away_mm <= reach_mm])
 
 
 def beside_walls(case: FlowCase, blood_mm: Floats) -> FlowCase:
