@@ -41,9 +41,9 @@ WHOLE_OVER_BLOCK = 3.5
 """Ratio of the run time of a flow to that of its time steps in a block of blood that fits the cache. The rest is walls,
 openings, checks, the initial flow and memory access. Measured: demo with Silk at 0.14 mm, 123 million updates per
 second against 440 in the block; 3.4 for C0038 at 0.2 mm, 4.8 for a small bifurcation."""
-AROUND_WIRES_OVER_BLOCK = 10.0
+AROUND_WIRES_OVER_BLOCK = 7.0
 """The same with finer levels around wires, where most of the time goes into the exchange between thin levels (demo with
-Enterprise from 0.2 to 0.025 mm: 44 million updates per second on two cores)."""
+Enterprise from 0.16 to 0.02 mm: 65 million updates per second on two cores)."""
 BLOCK_ROWS = 4095
 """Number of rows of the block used to measure the speed; odd, so that populations are not whole pages apart (see
 `setup.PAGE`)."""
