@@ -19,7 +19,7 @@ from vstent.flow.lattice.state import State
 from vstent.flow.settings import FlowSettings, Numerics
 from vstent.flow.simulation import simulate_case
 from vstent.geometry.surface import Surface
-from vstent.kernels.arrays import Floats
+from vstent.kernels.arrays import Floats, Ints
 from vstent.units import duration
 
 CELL_MM = 0.075
@@ -93,6 +93,27 @@ def test_wires_too_thin_for_the_grid_are_walls_on_a_finer_level(resolved: FlowCa
     made, foretold = sum(len(level.domain.cells) for level in state.levels), estimate(case).cells
     assert made == pytest.approx(foretold, rel=0.25)
     assert state.kept == (state,)
+
+
+def test_interpolation_between_levels_is_exact_for_cubic_functions(resolved: FlowCase) -> None:
+    case = replace(resolved, numerics=replace(resolved.numerics, cell_size_mm=2 * CELL_MM))
+    coarse, fine = LatticeBoltzmann(2 * CELL_MM).init(case, None).levels
+    assert coarse.interface is not None
+    down = coarse.interface.down
+    powers = np.array([(i, j, k) for i in range(4) for j in range(4 - i) for k in range(4 - i - j)])
+
+    def cubics(level: State, place: Ints) -> Floats:
+        order = np.argsort(level.addressing.place)
+        cell = order[np.searchsorted(level.addressing.place, place, sorter=order)]
+        return (
+            (level.domain.centers_mm[cell] - resolved.vessel.lumen.vertices_mm.mean(axis=0))[:, None] ** powers
+        ).prod(axis=2)
+
+    found = np.add.reduceat(down.weight[:, :1] * cubics(coarse, down.place)[down.cell], down.start[:-1])
+    is_whole = np.logical_and.reduceat(down.weight[:, 0] == down.weight[:, 1], down.start[:-1])
+    assert is_whole.mean() > 0.3
+    wanted = cubics(fine, down.target)
+    np.testing.assert_allclose(found[is_whole], wanted[is_whole], atol=1e-6 * np.abs(wanted).max())
 
 
 def test_walls_of_a_device_beside_a_neck_are_those_of_its_side_that_faces_it(resolved: FlowCase) -> None:
