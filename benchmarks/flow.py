@@ -4,7 +4,7 @@ Usage: python benchmarks/flow.py [--cost] [--pulse] [SURFACE] [CELL_MM ...]
 
 Besides: how a step's time grows with its cells, and what other machines would need (computed). Seconds of the clock
 depend on what else the machine does: processor seconds stand beside them. With ``--cost`` the demo is computed, steady,
-bare and with Silk and Enterprise as screens, in cells of 0.1 mm, all over and then only in and near the sac
+bare and with Silk and Enterprise as screens, at a grid spacing of 0.1 mm, everywhere and then only in and near the sac
 (`Numerics.refine`). With ``--pulse`` it is computed bare for two cycles of a pulse, in both ways. With a surface
 file, in mm, that artery is, in the latter way alone.
 """
@@ -40,8 +40,8 @@ STEPS = 20
 BYTES_PER_UPDATE = 19 * 4 * 2
 """Read and write every population once, in place; addresses are one per segment."""
 DEMO_CELLS, STEADY_STEPS, STEPS_PER_CYCLE = 830_000, 6_000, 78_000
-"""The demo in cells of 0.1 mm: blood cells, steps of a bare flow that begins from a coarse one (`--cost` counts them),
-steps of a cycle (`--pulse` counts two)."""
+"""The demo at a grid spacing of 0.1 mm: blood cells, steps of a bare flow that begins from a coarse one (`--cost`
+counts them), steps of a cycle (`--pulse` counts two)."""
 NODE_CORES, NODE_GB_S = 64, 300.0
 """A node, and its memory's bandwidth (two sockets of eight channels, three quarters of 400 GB/s)."""
 GPU_GB_S, GPU_SHARE = 1555.0, 0.6
@@ -97,7 +97,7 @@ def throughput(vessel: Vessel, cell_mm: float) -> tuple[int, float, float]:
 
 
 def elsewhere(of_core: float) -> None:
-    """Print what the demo in cells of 0.1 mm would take on other machines: computed, not measured."""
+    """Print the run time of the demo at 0.1 mm on other machines: computed, not measured."""
     limits = {
         f"{NODE_CORES} cores": min(NODE_CORES * of_core, NODE_GB_S * 1e9 / BYTES_PER_UPDATE),
         "one GPU": GPU_SHARE * GPU_GB_S * 1e9 / BYTES_PER_UPDATE,
@@ -152,7 +152,7 @@ def tell(now: Progress) -> None:
 def named(surface: Path | None, *, refine: tuple[Region, ...]) -> str:
     """What is computed, in words."""
     name = "demo" if surface is None else surface.stem
-    return f"{name}, cells of 0.1 mm{' in and near the sac' if refine else ''}"
+    return f"{name}, grid spacing 0.1 mm{' in and near the sac' if refine else ''}"
 
 
 def table(case: FlowCase, fields: dict[str, FlowField], clock_s: float, core_s: float) -> None:
