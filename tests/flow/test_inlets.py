@@ -299,7 +299,7 @@ def test_refinement_in_the_sac_takes_in_what_every_inlet_brings() -> None:
     np.testing.assert_allclose(close.inlets_mL_s, whole.inlets_mL_s, rtol=5e-3)
     sac = anatomy.aneurysms[0]
     inflow = [indices(field, sac.sac, sac.neck)["neck_inflow_mL_s"] for field in (whole, close)]
-    # Two thirds of what cells of 0.1 mm all over give: the close-up's longer steps are 2 % nearer to that.
+    # Two thirds of the inflow at 0.1 mm everywhere; the longer time steps of the refined grid are 2 % nearer to that.
     assert inflow[1] == pytest.approx(inflow[0], rel=0.08)
 
 

@@ -14,7 +14,7 @@ from vstent.kernels import directions
 SHAPE = np.array([32, 1, 32])
 """Cells of a box that repeats in all directions; nothing varies along its second axis."""
 CELL_M, STEP_S = 1e-4, 1.1e-5
-"""Those of an artery's flow in cells of 0.1 mm, at its usual time step."""
+"""Those of an artery's flow at a grid spacing of 0.1 mm, at its usual time step."""
 VISCOSITY_M2_S, DENSITY_KG_M3 = 0.004 / 1060, 1060.0
 VISCOSITY = VISCOSITY_M2_S * STEP_S / CELL_M**2
 SETTLED = 1e-5

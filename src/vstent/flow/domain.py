@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import floor, log2
 
 import numpy as np
 from scipy import ndimage
@@ -32,6 +33,9 @@ six cells across (Re 10 to 340), 10 to 310 % with four, and 1.4 to 15 times the 
 LEAST_ACROSS = 2.3
 """Number of cells that a wire taken as a wall needs across. The error in the drag of rows of wires, by their
 position on the grid, is -20 to +6 % with two cells across, -8 to +2 % with three and -4 to +2 % with four."""
+LEAST_OF_OPEN = 0.6
+"""Least part of itself to which an open grid spacing is reduced for wires that are walls. Below, the whole vessel costs
+more than walls that are finer than needed."""
 WALL = 0
 """Patch number of the wall; opening k has patch number k + 1."""
 LEAST_PIECE = 64
@@ -176,21 +180,31 @@ def default_cell_size_mm(case: FlowCase) -> float:
     """Return the grid spacing of a case: as set, else from `cells_per_diameter` and `cell_budget`.
 
     The cells are counted across the mean diameter 4 V / A of the vessel, or across its inlet where that is narrower,
-    because a large sac increases the mean.
+    because a large sac increases the mean. Where wires are walls, an open spacing is reduced so that repeated halving
+    gives the largest one that suits the wires.
     """
     numerics, size_mm = case.numerics, case.numerics.cell_size_mm
     if size_mm is None:
         across_mm = min(mean_diameter_mm(case.vessel), case.vessel.inlet.diameter_mm)
         by_diameter = across_mm / numerics.cells_per_diameter
         size_mm = max(by_diameter, (case.vessel.closed.volume_mm3 / numerics.cell_budget) ** (1 / 3))
+        if numerics.wires == "resolved" and case.wires is not None:
+            at_walls_mm = around_walls_mm(case.wires)
+            suited_mm = at_walls_mm * 2.0 ** max(1, floor(log2(size_mm / at_walls_mm)))
+            return suited_mm if LEAST_OF_OPEN * size_mm < suited_mm < size_mm else size_mm
     return size_mm
+
+
+def around_walls_mm(wires: Surface) -> float:
+    """Return the largest grid spacing on which wires can be walls."""
+    return thickness_mm(wires) / LEAST_ACROSS
 
 
 def wires_of(case: FlowCase, cell_size_mm: float) -> Surface | None:
     """Return the wires that are walls on a grid of this spacing; None where the media stand for them."""
     if case.numerics.wires != "resolved" or case.wires is None:
         return None
-    return case.wires if thickness_mm(case.wires) > LEAST_ACROSS * cell_size_mm else None
+    return case.wires if cell_size_mm <= around_walls_mm(case.wires) else None
 
 
 def mean_diameter_mm(vessel: Vessel) -> float:

@@ -75,7 +75,7 @@ def computed(kind: str) -> tuple[FlowCase, FlowField | None, FlowField]:
     if kind == "stented":
         start = simulate_case(case)
         case = replace(case, media=(screen(),))
-    if "close-up" in kind:
+    if "refined" in kind:
         sac = Surface(sphere(1.0).vertices_mm + np.array([0.0, 0.0, 5.0]), sphere(1.0).faces)
         numerics = replace(settings.numerics, cell_size_mm=0.2, refine=("sac",))
         case = replace(case, target=Target(sac, None), numerics=numerics)
@@ -83,7 +83,7 @@ def computed(kind: str) -> tuple[FlowCase, FlowField | None, FlowField]:
 
 
 @pytest.mark.parametrize(
-    "kind", ["steady", "pulsatile", "stented", "close-up", "pulsatile close-up", "windkessel", "pulsatile windkessel"]
+    "kind", ["steady", "pulsatile", "stented", "refined", "pulsatile refined", "windkessel", "pulsatile windkessel"]
 )
 @pytest.mark.parametrize("saves", [2, 9])
 def test_a_stopped_flow_goes_on_to_the_same_bits(

@@ -123,7 +123,7 @@ def test_a_guess_that_diverges_is_done_without(monkeypatch):
 
 
 def test_a_guess_whose_grid_is_too_coarse_is_done_without(monkeypatch):
-    """At 45 degrees to the grid a throat of 0.5 mm is closed in cells of 0.44 mm; those of 0.11 mm leave it open."""
+    """At 45 degrees to the grid a throat of 0.5 mm is closed at a grid spacing of 0.44 mm and open at 0.11 mm."""
     points, frames = line(18.0)
     radius = 2.0 - 1.75 * np.exp(-(((points[:, 2] - 8.0) / 1.5) ** 2))
     turn = np.array([[1, 0, 1], [0, 2**0.5, 0], [-1, 0, 1]]) / 2**0.5

@@ -181,7 +181,7 @@ def everything() -> lattice_state.State:
     openings[2, [d3q19.KIND, d3q19.WANTED]] = d3q19.OUTFLOW, -0.5 * openings[0, d3q19.WANTED]
     openings[1:, d3q19.AREA] *= 0.5
     start = np.array([*links.start[:2], links.start[1:].mean(), links.start[2]], np.int32)
-    swing = np.array([1.0, 0.8, 1.2])  # what a close-up imposes in the course of a cycle
+    swing = np.array([1.0, 0.8, 1.2])  # what a refined part imposes in the course of a cycle
     wanted = openings[:, d3q19.WANTED].copy()
     course = 0.1 * swing[:, None] * np.abs(wanted).max() * [1.0, 0.0, 1.0]
     shape = swing[:, None, None] * links.shape

@@ -43,7 +43,7 @@ MEAN_M_S = INFLOW_ML_S / (np.pi * RADIUS_MM**2)
 
 
 def ball(center_mm: tuple[float, float, float], radius_mm: float = 1.0) -> Surface:
-    """Stands for a sac: what a close-up is of."""
+    """Stands for a sac around which the grid is refined."""
     whole = sphere(radius_mm)
     return Surface(whole.vertices_mm + np.array(center_mm), whole.faces)
 

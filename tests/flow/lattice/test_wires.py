@@ -132,6 +132,26 @@ def test_walls_of_a_device_beside_a_neck_are_those_of_its_side_that_faces_it(res
     assert beside[1].area_mm2 == pytest.approx(beside[0].area_mm2)
 
 
+@pytest.mark.parametrize(("wanted", "made"), [(1.9, 1.9), (2.1, 2.0), (3.3, 2.0), (3.4, 3.4), (6.6, 4.0), (6.7, 6.7)])
+def test_an_open_grid_spacing_is_reduced_so_that_its_halves_suit_the_wires(
+    resolved: FlowCase, wanted: float, made: float
+) -> None:
+    """In multiples of the largest spacing at the walls, by at most four tenths."""
+    assert resolved.wires is not None
+    suited_mm = domain.around_walls_mm(resolved.wires)
+    across_mm = min(domain.mean_diameter_mm(resolved.vessel), resolved.vessel.inlet.diameter_mm)
+    count = across_mm / (wanted * suited_mm)
+    numerics = replace(resolved.numerics, cell_size_mm=None, cells_per_diameter=count, cell_budget=1e9)
+    case = replace(resolved, numerics=numerics)
+    found_mm = domain.default_cell_size_mm(case)
+    assert found_mm == pytest.approx(made * suited_mm)
+    finest_mm = levels.sizes_mm(case, found_mm)[-1]
+    assert domain.wires_of(case, finest_mm) is case.wires
+    assert suited_mm / 2 < finest_mm <= suited_mm
+    as_screen = replace(case, numerics=replace(numerics, wires="screen"))
+    assert domain.default_cell_size_mm(as_screen) == pytest.approx(wanted * suited_mm)
+
+
 @pytest.mark.parametrize(("finer", "most"), [(1, 0.01), (2, 0.07)])
 def test_wires_on_a_finer_level_are_those_of_the_uniform_fine_grid(
     resolved: FlowCase, flow: State, finer: int, most: float
