@@ -315,7 +315,7 @@ class _Runs:
             field = self.answer(case, start)
             why = " The screen is not calibrated: no wires over the neck, wires 0.4 mm apart or more, or coils."
             return replace(field, advice=field.advice + why) if case.media else field
-        similar, factor, size_mm = self.similar, 1.0, default_cell_size_mm(case)
+        similar, factor = self.similar, 1.0
         rounds: list[tuple[float, float, float]] = []
         for number in range(runs - 1):
             steady = replace(calibration.scaled(case, factor), waveform=None)
@@ -326,7 +326,7 @@ class _Runs:
                 center_mm = calibration.strongest_mm(steady, similar)
                 walls = calibration.tile(steady, center_mm)
             told = partial(_of_tile, self._part((number + ROUND_SHARE) / runs, (number + 1) / runs), perf_counter())
-            rounds.append((factor, *calibration.read_off(steady, walls, similar, size_mm, center_mm, told)))
+            rounds.append((factor, *calibration.read_off(steady, walls, similar, center_mm, told)))
             factor = calibration.next_factor(rounds)
         if case.waveform is not None:  # a pulse begins with a phase of the one before, and converges in fewer cycles
             similar = self.similar

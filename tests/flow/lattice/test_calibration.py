@@ -210,7 +210,7 @@ def test_a_screen_whose_resistance_cannot_be_read_off_stays(braided: FlowCase, m
     center_mm = calibration.strongest_mm(case, screen)
     for found_there in ((1.0, 0.5), (np.nan, np.nan)):
         monkeypatch.setattr(calibration, "_resistance", lambda *_, found_there=found_there: found_there)
-        rounds = [(1.0, *calibration.read_off(case, case, screen, default_cell_size_mm(case), center_mm))]
+        rounds = [(1.0, *calibration.read_off(case, case, screen, center_mm))]
         assert calibration.next_factor(rounds) == 1.0
         assert calibration.next_factor([(0.8, 2.0, 1.5), (0.9, *rounds[0][1:])]) == 0.9
     assert "The screen is not calibrated: the force" in simulate_case(with_numerics(case, wires="calibrated")).advice

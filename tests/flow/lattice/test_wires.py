@@ -152,6 +152,15 @@ def test_an_open_grid_spacing_is_reduced_so_that_its_halves_suit_the_wires(
     assert domain.default_cell_size_mm(as_screen) == pytest.approx(wanted * suited_mm)
 
 
+def test_wires_around_which_no_cell_can_be_refined_are_refused(
+    resolved: FlowCase, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(levels, "near_wires", lambda _, grid, __: np.zeros(len(grid.cells), dtype=bool))
+    case = replace(resolved, numerics=replace(resolved.numerics, cell_size_mm=2.2 * CELL_MM))
+    with pytest.raises(domain.CoarseGridError, match=r"a grid of 0\.165 mm .* use a finer grid spacing"):
+        LatticeBoltzmann(2.2 * CELL_MM).init(case, None)
+
+
 @pytest.mark.parametrize(("finer", "most"), [(1, 0.01), (2, 0.07)])
 def test_wires_on_a_finer_level_are_those_of_the_uniform_fine_grid(
     resolved: FlowCase, flow: State, finer: int, most: float

@@ -63,9 +63,10 @@ def suits(case: FlowCase) -> bool:
 
 
 def tile(case: FlowCase, center_mm: Floats) -> FlowCase:
-    """Return a case in which only the wires within `TILE_MM` of a point are walls."""
+    """Return a case in which only the wires within `TILE_MM` of a point are walls, on the same grid."""
     solids = (part_of(one, lengths(one.wire_points_mm - center_mm) < TILE_MM) for one in case.solids)
-    return replace(case, solids=tuple(solids), numerics=replace(case.numerics, wires="resolved"))
+    numerics = replace(case.numerics, wires="resolved", cell_size_mm=default_cell_size_mm(case))
+    return replace(case, solids=tuple(solids), numerics=numerics)
 
 
 def strongest_mm(case: FlowCase, flow: FlowField) -> Floats:
@@ -85,7 +86,6 @@ def read_off(
     case: FlowCase,
     walls: FlowCase,
     flow: FlowField,
-    cell_size_mm: float,
     center_mm: Floats,
     told: Callable[[float], None] = lambda _: None,
 ) -> tuple[float, float]:
@@ -94,6 +94,7 @@ def read_off(
     Both are 1 where force and velocity are no measure of a resistance (see `LIKE_FLOW`). `told` gets the part of the
     walls that is done.
     """
+    cell_size_mm = default_cell_size_mm(walls)
     of_screen, _ = _resistance(case, flow, cell_size_mm, center_mm, lambda _: None)
     of_walls, likeness = _resistance(replace(walls, media=case.media), flow, cell_size_mm, center_mm, told)
     return (of_screen, of_walls) if likeness > LIKE_FLOW and min(of_screen, of_walls) > 0 else (1.0, 1.0)
@@ -118,7 +119,8 @@ def scaled(case: FlowCase, factor: float) -> FlowCase:
 def cost(case: FlowCase) -> tuple[float, float]:
     """Estimate the run time, s, of all tiles of a case, and the peak memory, bytes, of one."""
     assert case.ostium is not None
-    walls, size_mm = tile(case, case.ostium.vertices_mm.mean(axis=0)), default_cell_size_mm(case)
+    walls = tile(case, case.ostium.vertices_mm.mean(axis=0))
+    size_mm = default_cell_size_mm(walls)
     step_s = longest_step_s(case, sizes_mm(walls, size_mm)[-1], peak_speed_m_s(case, None))
     return ROUNDS * seconds_of(walls, size_mm, settling_s(case) / step_s), memory_bytes(walls)
 

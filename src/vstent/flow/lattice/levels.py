@@ -331,7 +331,10 @@ def window(grid: Domain, is_wanted: Bools, is_outer: Bools | None = None) -> tup
         ends[tuple(grid.cells[is_outer].T)] = True
         within &= ~ndimage.binary_dilation(ends, full, WIDTH * len(CARRIED_UP) + 1)
     if not within.any():
-        raise domains.CoarseGridError("no cell is left to be refined")
+        raise domains.CoarseGridError(
+            f"a grid of {grid.cell_size_mm:.3g} mm has no cell that can be refined: use a finer grid spacing, or leave "
+            "out --refine and --wires"
+        )
     front = blood & ~within
     within |= ndimage.binary_dilation(within, full) & ~blood  # finer cells may lie between coarser ones and the wall
     layer = np.where(within, CARRIED_UP[-1] + 1, 0)

@@ -2,7 +2,6 @@
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from time import perf_counter
 from typing import Any, Final
@@ -155,10 +154,14 @@ def _grids(case: FlowCase, cell_size_mm: float) -> list[tuple[Grid, Interface | 
         domain = domains.build(case.vessel, coarsest_mm, wires=domains.wires_of(case, coarsest_mm))
         limit = thickest(case, domain)
         grids: list[tuple[Grid, Interface | None]] = [(Grid(domain, limit, address(domain, limit)), None)]
-        with suppress(domains.CoarseGridError):  # the rest of a branch is too short
-            while len(grids) < len(sizes):
+        while len(grids) < len(sizes):
+            try:
                 coarse, fine, between = refined(case, grids[-1][0], cell_size_mm)
-                grids[-1:] = (coarse, grids[-1][1]), (fine, between)
+            except domains.CoarseGridError:
+                if len(grids) <= case.numerics.coarser_levels + wire_levels(case, cell_size_mm):
+                    raise
+                break  # the rest of a narrow branch is too short
+            grids[-1:] = (coarse, grids[-1][1]), (fine, between)
         built[key] = grids
     return [(grid, between and between.anew()) for grid, between in built[key]]
 
