@@ -12,7 +12,7 @@ from vstent.deployment.struts import thickness_mm
 from vstent.errors import FlowError
 from vstent.flow import sampling
 from vstent.flow.case import Cells, FlowCase
-from vstent.flow.settings import Blood
+from vstent.flow.settings import LATTICE, Blood
 from vstent.geometry.surface import Surface
 from vstent.geometry.vessel import Opening, Vessel
 from vstent.kernels import triangles, voxels
@@ -188,8 +188,8 @@ def default_cell_size_mm(case: FlowCase) -> float:
         across_mm = min(mean_diameter_mm(case.vessel), case.vessel.inlet.diameter_mm)
         by_diameter = across_mm / numerics.cells_per_diameter
         size_mm = max(by_diameter, (case.vessel.closed.volume_mm3 / numerics.cell_budget) ** (1 / 3))
-        if numerics.wires == "resolved" and case.wires is not None:
-            at_walls_mm = around_walls_mm(case.wires)
+        if numerics.wires == "resolved" and numerics.engine == LATTICE and case.wires is not None:
+            at_walls_mm = 0.99 * around_walls_mm(case.wires)  # so that the spacing as it is reported suits them too
             suited_mm = at_walls_mm * 2.0 ** max(1, floor(log2(size_mm / at_walls_mm)))
             return suited_mm if LEAST_OF_OPEN * size_mm < suited_mm < size_mm else size_mm
     return size_mm

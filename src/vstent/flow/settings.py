@@ -171,7 +171,7 @@ class Numerics:
     cells_across_neck: float = 32.0
     """Least number of cells across a neck with a screen, on a finer level around it where no grid spacing is given."""
     cell_budget: float = 480_000.0
-    """Maximum number of cells in the vessel, where no grid spacing is given."""
+    """Maximum number of cells in the vessel, where no grid spacing is given; 4.6 times as many if wires are walls."""
     tolerance: float = 0.01
     """A flow has converged when every monitored quantity is expected to change by less than this fraction of itself,
     and the velocity in the sac by less than twice this fraction (root mean square). An unsteady flow has converged

@@ -121,22 +121,30 @@ def test_walls_of_a_device_beside_a_neck_are_those_of_its_side_that_faces_it(res
     middle_mm = resolved.vessel.centerlines[0].points_mm.mean(axis=0)
     turned_mm = (over_neck.wire_points_mm - middle_mm) * (-1.0, -1.0, 1.0) + middle_mm
     both = replace(resolved, solids=(over_neck, replace(over_neck, wire_points_mm=turned_mm)))
+    assert resolved.sac is not None
+    shrunk_mm = 0.2 * (over_neck.wire_points_mm - over_neck.wire_points_mm.mean(axis=0))
+    in_sac_mm = shrunk_mm + resolved.sac.vertices_mm.mean(axis=0) + (1.5, 0.0, 0.0)
+    coiled = replace(resolved, solids=(over_neck, replace(over_neck, wire_points_mm=in_sac_mm)))
     assert resolved.target is not None
     parts = (resolved.target.sac, resolved.target.ostium)
     sac, ostium = (Surface(one.vertices_mm + np.array([1.5, 0.0, 0.0]), one.faces) for one in parts)
     beside = [
         levels._around(replace(case, target=replace(resolved.target, sac=sac, ostium=ostium)))
-        for case in (resolved, both)
+        for case in (resolved, both, coiled)
     ]
     assert beside[0].area_mm2 > 0.5 * struts(over_neck).area_mm2
     assert beside[1].area_mm2 == pytest.approx(beside[0].area_mm2)
+    in_sac_mm2 = struts(coiled.solids[1]).area_mm2
+    assert beside[2].area_mm2 == pytest.approx(beside[0].area_mm2 + in_sac_mm2)
 
 
-@pytest.mark.parametrize(("wanted", "made"), [(1.9, 1.9), (2.1, 2.0), (3.3, 2.0), (3.4, 3.4), (6.6, 4.0), (6.7, 6.7)])
+@pytest.mark.parametrize(
+    ("wanted", "made"), [(1.9, 1.9), (2.1, 1.98), (3.2, 1.98), (3.4, 3.4), (6.5, 3.96), (6.7, 6.7)]
+)
 def test_an_open_grid_spacing_is_reduced_so_that_its_halves_suit_the_wires(
     resolved: FlowCase, wanted: float, made: float
 ) -> None:
-    """In multiples of the largest spacing at the walls, by at most four tenths."""
+    """In multiples of the largest spacing at the walls, by at most four tenths; what is printed of it suits as well."""
     assert resolved.wires is not None
     suited_mm = domain.around_walls_mm(resolved.wires)
     across_mm = min(domain.mean_diameter_mm(resolved.vessel), resolved.vessel.inlet.diameter_mm)
@@ -148,8 +156,10 @@ def test_an_open_grid_spacing_is_reduced_so_that_its_halves_suit_the_wires(
     finest_mm = levels.sizes_mm(case, found_mm)[-1]
     assert domain.wires_of(case, finest_mm) is case.wires
     assert suited_mm / 2 < finest_mm <= suited_mm
-    as_screen = replace(case, numerics=replace(numerics, wires="screen"))
-    assert domain.default_cell_size_mm(as_screen) == pytest.approx(wanted * suited_mm)
+    printed_mm = float(f"{found_mm:.3g}")
+    assert len(levels.sizes_mm(case, printed_mm)) == len(levels.sizes_mm(case, found_mm))
+    for other in (replace(numerics, wires="screen"), replace(numerics, engine="openfoam")):
+        assert domain.default_cell_size_mm(replace(case, numerics=other)) == pytest.approx(wanted * suited_mm)
 
 
 def test_wires_around_which_no_cell_can_be_refined_are_refused(

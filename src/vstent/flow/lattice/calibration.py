@@ -83,11 +83,7 @@ def strongest_mm(case: FlowCase, flow: FlowField) -> Floats:
 
 
 def read_off(
-    case: FlowCase,
-    walls: FlowCase,
-    flow: FlowField,
-    center_mm: Floats,
-    told: Callable[[float], None] = lambda _: None,
+    case: FlowCase, walls: FlowCase, flow: FlowField, center_mm: Floats, told: Callable[[float], None] = lambda _: None
 ) -> tuple[float, float]:
     """Return what the screen of a steady case and the walls of a tile resist to a flow, up to a common constant.
 

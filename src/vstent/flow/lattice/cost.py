@@ -49,8 +49,8 @@ BLOCK_ROWS = 4095
 `setup.PAGE`)."""
 BLOCK_BAND = 15
 """Number of rows in each of its bands."""
-MARGIN = 1.05
-"""Factor by which the suggested grid spacing is increased until the flow fits."""
+MARGIN = 1.1
+"""Factor by which the suggested grid spacing, of two digits, is increased until the flow fits."""
 
 
 @dataclass(frozen=True)
@@ -109,8 +109,8 @@ def refuse_too_large(case: FlowCase, free_bytes: float | None = None, gpu_bytes:
     if (cells := _size(case, cell_size_mm)[0]) > MOST_CELLS:
         raise FlowError(
             f"a grid spacing of {cell_size_mm:.3g} mm gives {cells / 1e6:.3g} million cells, more than the "
-            f"largest number of {MOST_CELLS / 1e6:.0f} million: use a grid spacing of "
-            f"{_fitting_mm(case, lambda cell_mm: _size(case, cell_mm)[0], MOST_CELLS):.2g} mm"
+            f"largest number of {MOST_CELLS / 1e6:.0f} million: "
+            f"{_instead(case, lambda cell_mm: _size(case, cell_mm)[0], MOST_CELLS)}"
         )
     _refuse(case, lambda cell_mm: _size(case, cell_mm)[1], free_bytes, "memory")
     if case.numerics.device_gpu:
@@ -139,16 +139,18 @@ def _refuse(case: FlowCase, needed_bytes: Callable[[float], float], free_bytes: 
     raise FlowError(
         f"a grid spacing of {cell_size_mm:.3g} mm gives {_size(case, cell_size_mm)[0] / 1e6:.3g} million cells "
         f"and needs {needed_bytes(cell_size_mm) / 1e9:.2g} GB, but {free_bytes / 1e9:.2g} GB of {of} are free: "
-        f"use a grid spacing of {_fitting_mm(case, needed_bytes, free_bytes):.2g} mm"
+        f"{_instead(case, needed_bytes, free_bytes)}"
     )
 
 
-def _fitting_mm(case: FlowCase, needed: Callable[[float], float], most: float) -> float:
-    """Return the smallest grid spacing tried, from the case's own upwards, at which at most `most` is needed."""
+def _instead(case: FlowCase, needed: Callable[[float], float], most: float) -> str:
+    """Return what to do about a case that needs too much: the next coarser spacing that fits, or a screen for walls."""
+    if case.numerics.wires == "resolved" and case.wires is not None:  # a coarser grid may have finer walls
+        return "use a screen (--wires screen)"
     own_mm = fitting_mm = default_cell_size_mm(case)
     while needed(fitting_mm) > most and fitting_mm < 1e3 * own_mm:
-        fitting_mm *= MARGIN
-    return fitting_mm
+        fitting_mm = float(f"{MARGIN * fitting_mm:.2g}")
+    return f"use a grid spacing of {fitting_mm:.2g} mm"
 
 
 def memory_bytes(case: FlowCase) -> float:

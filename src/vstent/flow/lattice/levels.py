@@ -73,9 +73,8 @@ UPSTREAM_DIAMETERS, DOWNSTREAM_DIAMETERS = 5.0, 1.0
 The flow into the sac forms upstream: beside the same spacing everywhere (0.14 mm) the demo's neck inflow is 2 % lower
 with one diameter, 1 % lower with two, 3 % higher with three and 2 % higher with five."""
 BESIDE_NECK: Final = 0.5
-"""Distance in neck diameters by which wires that are walls on finer levels are at most farther from the sac than the
-nearest one; beyond they are a screen. With a quarter the neck inflow at a fork (T) is 5 % higher than with all wires as
-walls, with a half equal."""
+"""Distance in neck diameters from the nearest wire outside the sac up to which wires are walls on finer levels. Beyond,
+they are a screen. Neck inflow at a fork (T) is 2 % higher than with all wires as walls; with a quarter it is 5 %."""
 MARGIN_CELLS: Final = 14.0
 """Distance in cells by which a refined part around wires exceeds the next finer one: with less, the distance kept from
 the border and `RIM` leave no room for that along diagonals."""
@@ -258,8 +257,9 @@ def _around(case: FlowCase) -> Surface:
     if case.sac is None or case.ostium is None:
         return case.wires
     away_mm = case.sac.signed_distance(case.wires.corners_mm.mean(axis=1))
-    reach_mm = max(0.0, away_mm.min()) + BESIDE_NECK * neck_diameter_mm(case.ostium)
-    return Surface(case.wires.vertices_mm, case.wires.faces[away_mm <= reach_mm])
+    nearest_mm = np.min(away_mm, where=away_mm > 0, initial=inf)  # coils in the sac are nearer than a device beside it
+    is_near = away_mm <= nearest_mm + BESIDE_NECK * neck_diameter_mm(case.ostium)
+    return Surface(case.wires.vertices_mm, case.wires.faces[is_near])
 
 
 def beside_walls(case: FlowCase, blood_mm: Floats) -> FlowCase:
@@ -331,8 +331,7 @@ def window(grid: Domain, is_wanted: Bools, is_outer: Bools | None = None) -> tup
         within &= ~ndimage.binary_dilation(ends, full, WIDTH * len(CARRIED_UP) + 1)
     if not within.any():
         raise domains.CoarseGridError(
-            f"a grid of {grid.cell_size_mm:.3g} mm has no cell that can be refined: use a finer grid spacing, or leave "
-            "out --refine and --wires"
+            f"a grid of {grid.cell_size_mm:.3g} mm has no cell that can be refined: use a finer grid spacing"
         )
     front = blood & ~within
     within |= ndimage.binary_dilation(within, full) & ~blood  # finer cells may lie between coarser ones and the wall
