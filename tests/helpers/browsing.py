@@ -39,7 +39,7 @@ def at(address, width=1280, height=720, expected=None, **options):
         # Without gliding views: what is to be pulled or clicked on the scene would move away.
         page = browser.new_page(viewport={"width": width, "height": height}, reduced_motion="reduce", **options)
         page.set_default_timeout(120 * SECOND)
-        page.on("console", lambda message: complaints.append(message.text))
+        page.on("console", lambda message: complaints.append(f"{message.text} {message.location['url']}"))
         page.on("pageerror", lambda error: complaints.append(str(error)))
         own = (f"http://{host}/", "data:", "blob:")
         page.on("request", lambda request: request.url.startswith(own) or complaints.append(request.url))

@@ -38,8 +38,8 @@ COARSE_SHARE = 0.12
 
 QUICK_S = 600.0
 """Expected run time up to which wires are resolved or calibrated where that is left to the program."""
-USUAL_PART = 1 / 3
-"""Usual part of the most that a flow may take: flows with walls took 0.2 to 0.3 of it."""
+USUAL_PART = 1 / 2
+"""Usual part of the most that a flow may take: flows with walls took 0.3 (demo, tee) to 0.8 of it (arc, T)."""
 
 CALMER_TRIES = 3
 """Maximum number of retries of a diverged run, each with a shorter time step."""
