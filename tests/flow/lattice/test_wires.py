@@ -8,11 +8,12 @@ from small_neck import covered
 
 import vstent
 from vstent.deployment.struts import struts, united
+from vstent.errors import FlowError
 from vstent.flow import domain, simulation
 from vstent.flow.case import FlowCase
 from vstent.flow.indices import indices
 from vstent.flow.lattice import levels, stepping
-from vstent.flow.lattice.cost import estimate
+from vstent.flow.lattice.cost import estimate, refuse_too_large
 from vstent.flow.lattice.engine import LatticeBoltzmann
 from vstent.flow.lattice.reading import exchanged, force_N
 from vstent.flow.lattice.state import State
@@ -169,6 +170,12 @@ def test_wires_around_which_no_cell_can_be_refined_are_refused(
     case = replace(resolved, numerics=replace(resolved.numerics, cell_size_mm=2.2 * CELL_MM))
     with pytest.raises(domain.CoarseGridError, match=r"a grid of 0\.165 mm .* use a finer grid spacing"):
         LatticeBoltzmann(2.2 * CELL_MM).init(case, None)
+
+
+def test_walls_that_do_not_fit_in_memory_are_refused_in_favour_of_a_screen(resolved: FlowCase) -> None:
+    """A coarser grid may have finer walls, and need more."""
+    with pytest.raises(FlowError, match=r"1e-05 GB of memory are free: use a screen \(--wires screen\)"):
+        refuse_too_large(resolved, free_bytes=1e4)
 
 
 @pytest.mark.parametrize(("finer", "most"), [(1, 0.01), (2, 0.07)])
