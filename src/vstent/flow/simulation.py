@@ -29,8 +29,8 @@ from vstent.flow.settings import LATTICE, OPENFOAM, RESISTING, FlowSettings, Num
 from vstent.geometry.vessel import Anatomy
 from vstent.units import duration
 
-SCREEN_SHARE = 0.02
-"""Assumed share of the run time of the flow with a screen, from which one with resolved wires begins."""
+SCREEN_SHARE = 0.15
+"""Share of the run time of the flow with a screen, from which one with resolved wires begins (measured: 0.1 to 0.2)."""
 ROUND_SHARE = 0.6
 """Assumed share of the run time of the flow in a round of a calibration; the rest is that of the tile."""
 COARSE_SHARE = 0.12
