@@ -106,6 +106,11 @@ class FlowCase:
         return joined(solids) if solids else None
 
     @property
+    def walls(self) -> Surface | None:
+        """The wires where they are resolved; None where media stand for them."""
+        return self.wires if self.numerics.wires == "resolved" else None
+
+    @property
     def has_screen(self) -> bool:
         """Whether a neck or an ostium has wires over it other than those of coils, and they are media."""
         wires = (one for one in self.solids if not isinstance(one, Coils))

@@ -188,8 +188,8 @@ def default_cell_size_mm(case: FlowCase) -> float:
         across_mm = min(mean_diameter_mm(case.vessel), case.vessel.inlet.diameter_mm)
         by_diameter = across_mm / numerics.cells_per_diameter
         size_mm = max(by_diameter, (case.vessel.closed.volume_mm3 / numerics.cell_budget) ** (1 / 3))
-        if numerics.wires == "resolved" and numerics.engine == LATTICE and case.wires is not None:
-            at_walls_mm = 0.99 * around_walls_mm(case.wires)  # so that the spacing as it is reported suits them too
+        if numerics.engine == LATTICE and case.walls is not None:
+            at_walls_mm = 0.99 * around_walls_mm(case.walls)  # so that the spacing as it is reported suits them too
             suited_mm = at_walls_mm * 2.0 ** max(1, floor(log2(size_mm / at_walls_mm)))
             return suited_mm if LEAST_OF_OPEN * size_mm < suited_mm < size_mm else size_mm
     return size_mm
@@ -202,9 +202,8 @@ def around_walls_mm(wires: Surface) -> float:
 
 def wires_of(case: FlowCase, cell_size_mm: float) -> Surface | None:
     """Return the wires that are walls on a grid of this spacing; None where the media stand for them."""
-    if case.numerics.wires != "resolved" or case.wires is None:
-        return None
-    return case.wires if cell_size_mm <= around_walls_mm(case.wires) else None
+    walls = case.walls
+    return walls if walls is not None and cell_size_mm <= around_walls_mm(walls) else None
 
 
 def mean_diameter_mm(vessel: Vessel) -> float:

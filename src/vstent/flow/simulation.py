@@ -21,9 +21,14 @@ from vstent.flow.background import BackgroundWork
 from vstent.flow.case import FlowCase, FlowField, Level, Phase
 from vstent.flow.domain import MIN_CELLS, CoarseGridError, default_cell_size_mm
 from vstent.flow.engines import AbstractEngine, DivergenceError, Progress, Saved, run
+from vstent.flow.lattice import calibration
+from vstent.flow.lattice.cost import estimate, fits
+from vstent.flow.lattice.engine import LatticeBoltzmann, PulsatileLatticeBoltzmann
 from vstent.flow.lattice.gpu import require_gpu
 from vstent.flow.measured import MeasuredProfile
 from vstent.flow.memory import free_memory_bytes
+from vstent.flow.openfoam import program
+from vstent.flow.openfoam.engine import OpenFoam
 from vstent.flow.problem import flow_case
 from vstent.flow.settings import LATTICE, OPENFOAM, RESISTING, FlowSettings, Numerics, Wires
 from vstent.geometry.vessel import Anatomy
@@ -138,9 +143,6 @@ def _with_wires(case: FlowCase, wires: Wires) -> FlowCase:
 
 def _decided(case: FlowCase) -> tuple[FlowCase, str]:
     """Return a case with its wires as walls or as a screen where that is open, and a sentence with the reason."""
-    from vstent.flow.lattice import calibration
-    from vstent.flow.lattice.cost import estimate, fits
-
     are_coils = any(isinstance(one, Coils) for one in case.solids)  # their indices are those of a porous region
     if case.numerics.wires != "auto" or case.numerics.engine != LATTICE or case.wires is None or are_coils:
         return (_with_wires(case, "screen") if case.numerics.wires == "auto" else case), ""
@@ -173,8 +175,6 @@ def _resisted(case: FlowCase, bare: FlowField | None) -> FlowCase:
 
 def foretell_cost(case: FlowCase) -> str:
     """Return a sentence on the expected run time and memory of a flow; one that does not fit is refused."""
-    from vstent.flow.lattice import calibration
-
     case, remark = _decided(case)
     sentence = _engine_of(case)(default_cell_size_mm(case)).cost(case)
     if _is_calibrated(case):
@@ -188,8 +188,6 @@ def foretell_cost(case: FlowCase) -> str:
 
 def memory_bytes(case: FlowCase) -> float | None:
     """Return the expected peak memory of a flow; None where its engine does not estimate it."""
-    from vstent.flow.lattice import calibration
-
     case, _ = _decided(case)
     own = _engine_of(case)(default_cell_size_mm(case)).memory_bytes(case)
     return max(own or 0.0, calibration.cost(case)[1]) if _is_calibrated(case) else own
@@ -197,16 +195,11 @@ def memory_bytes(case: FlowCase) -> float | None:
 
 def _is_calibrated(case: FlowCase) -> bool:
     """Return whether the screen of a case is calibrated."""
-    from vstent.flow.lattice import calibration
-
     return case.numerics.wires == "calibrated" and _engine_of(case).has_levels and calibration.suits(case)
 
 
 def engine_class(numerics: Numerics, *, is_pulsatile: bool) -> type[AbstractEngine[Any]]:
     """Return the engine that the settings name: one of vstent's own or a plug-in; unsupported settings are refused."""
-    from vstent.flow.lattice.engine import LatticeBoltzmann, PulsatileLatticeBoltzmann
-    from vstent.flow.openfoam.engine import OpenFoam
-
     lattice = PulsatileLatticeBoltzmann if is_pulsatile else LatticeBoltzmann
     built_in: dict[str, type[AbstractEngine[Any]]] = {LATTICE: lattice, OPENFOAM: OpenFoam}
     engine = built_in.get(numerics.engine) or plugins.load(
@@ -238,8 +231,6 @@ def check_engine(flow: FlowSettings | None, *, runs_here: bool = True) -> None:
 
     FlowError is raised where a flow that runs here needs a program that is not installed.
     """
-    from vstent.flow.openfoam import program
-
     if flow is not None:
         engine = engine_class(flow.numerics, is_pulsatile=flow.waveform is not None)
         wanted = [f"--outlets {flow.outlets}"] if flow.outlets in RESISTING else []
@@ -282,7 +273,7 @@ class _Runs:
         """
         if case.numerics.wires == "calibrated" and self.engine.has_levels:
             return self._calibrated(case, start)
-        if case.numerics.wires == "resolved" and case.wires is not None and self.engine.has_levels:
+        if case.walls is not None and self.engine.has_levels:
             as_screen = replace(self, progress=self._part(0.0, SCREEN_SHARE))
             begun = partial(as_screen.answer, _with_wires(case, "screen"), start)
             return self._run("resolved", case, default_cell_size_mm(case), begun, (SCREEN_SHARE, 1.0))
@@ -308,8 +299,6 @@ class _Runs:
 
     def _calibrated(self, case: FlowCase, start: FlowField | None) -> FlowField:
         """Compute the flow with a screen that is calibrated in steady flows; what cannot be calibrated stays."""
-        from vstent.flow.lattice import calibration
-
         case, runs = _with_wires(case, "screen"), calibration.ROUNDS + 1
         if not calibration.suits(case):
             field = self.answer(case, start)

@@ -145,7 +145,7 @@ def _refuse(case: FlowCase, needed_bytes: Callable[[float], float], free_bytes: 
 
 def _instead(case: FlowCase, needed: Callable[[float], float], most: float) -> str:
     """Return what to do about a case that needs too much: the next coarser spacing that fits, or a screen for walls."""
-    if case.numerics.wires == "resolved" and case.wires is not None:  # a coarser grid may have finer walls
+    if case.walls is not None:  # a coarser grid may have finer walls
         return "use a screen (--wires screen)"
     own_mm = fitting_mm = default_cell_size_mm(case)
     while needed(fitting_mm) > most and fitting_mm < 1e3 * own_mm:
@@ -183,8 +183,8 @@ def part_of_steps(case: FlowCase, levels: int) -> float:
 
     It is small where it begins from a flow on the coarsest level, or from the flow with a screen.
     """
-    coarser, are_walls = case.numerics.coarser_levels, case.numerics.wires == "resolved" and case.wires is not None
-    return 1 / 8 if are_walls and levels > 1 + coarser else 1 / 3 if coarser else 1.0
+    coarser = case.numerics.coarser_levels
+    return 1 / 8 if case.walls is not None and levels > 1 + coarser else 1 / 3 if coarser else 1.0
 
 
 @cache
