@@ -56,8 +56,8 @@ STATED = {
     "windkessel-proximal": ("0.1", Settings(flow=FlowSettings(proximal_fraction=0.1))),
     "grid-spacing": ("0.2", Settings(flow=FlowSettings(numerics=Numerics(cell_size_mm=0.2)))),
     "refine": (
-        "sac; branches; 1,-2,3.5,4",
-        Settings(flow=FlowSettings(numerics=Numerics(refine=("sac", "branches", (1.0, -2.0, 3.5, 4.0))))),
+        "sac; inlet; branches; 1,-2,3.5,4",
+        Settings(flow=FlowSettings(numerics=Numerics(refine=("sac", "inlet", "branches", (1.0, -2.0, 3.5, 4.0))))),
     ),
     "wires": ("resolved", Settings(flow=FlowSettings(numerics=Numerics(wires="resolved")))),
     "engine": ("openfoam", Settings(flow=FlowSettings(numerics=Numerics(engine="openfoam")))),

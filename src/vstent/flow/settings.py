@@ -21,7 +21,7 @@ Outlets = Literal["zero_pressure", "murray", "split", "resistance", "windkessel"
 """Condition at the outlets."""
 Wires = Literal["auto", "screen", "calibrated", "resolved"]
 """How a flow takes the wires over necks and branches."""
-Region = Literal["sac", "branches"] | tuple[float, float, float, float]
+Region = Literal["sac", "inlet", "branches"] | tuple[float, float, float, float]
 """Part of a vessel: a word, or center, LPS, and radius of a ball, mm."""
 RESISTING: Final = ("resistance", "windkessel")
 """Conditions with which the flow out follows the pressure."""
@@ -39,13 +39,14 @@ HIGH_SHEAR_VISCOSITY_PA_S: Final = 0.00345
 
 def read_region(text: str) -> str | tuple[float, ...]:
     """Return a `Region` read from text."""
-    if (word := text.strip()) in ("sac", "branches"):
+    if (word := text.strip()) in ("sac", "inlet", "branches"):
         return word
     with suppress(InputError):
         if len(found := numbers(word)) == 4:
             return found
     raise InputError(
-        f"{text!r} is no part of a vessel: give sac, branches, or center and radius of a ball in mm, such as 3,-12,8,2"
+        f"{text!r} is no part of a vessel: give sac, inlet, branches, or center and radius of a ball in mm, such as "
+        "3,-12,8,2"
     )
 
 
@@ -145,8 +146,8 @@ class Numerics:
     refine: tuple[Region, ...] = setting(
         (),
         "refine",
-        "where the grid is refined: with sac (and the artery near it) or a ball X,Y,Z,R the grid spacing holds only "
-        "there, and twice it elsewhere; with branches, those of fewer than six cells across have down to a quarter",
+        "where the grid is refined: with sac (and the artery near it), inlet (and its jet) or a ball X,Y,Z,R the grid "
+        "spacing holds only there, and twice it elsewhere; with branches, those of fewer than six cells across have down to a quarter",
         read_region,
         POSITION,
         metavar="WHERE",

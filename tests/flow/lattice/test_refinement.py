@@ -431,6 +431,20 @@ def test_the_grid_spacing_holds_in_a_ball_and_twice_it_elsewhere() -> None:
     assert len(LatticeBoltzmann(0.2).init(both, None).levels[1].domain.cells) > len(fine.cells)
 
 
+def test_a_jet_from_a_narrow_inlet_is_that_of_the_fine_grid() -> None:
+    """From 1.6 to 4 mm: twice the grid spacing everywhere has a jet that is 7 % slower at the end of the tube."""
+    path = line(9.0)
+    vessel = tube(path, 0.8 + 1.2 * np.clip((path[0][:, 2] - 2.0) / 1.5, 0, 1)).vessel
+    on_axis_mm = np.outer(np.arange(3.0, 7.0), [0.0, 0.0, 1.0])
+
+    def speeds_m_s(size_mm: float, *refine: Region) -> Floats:
+        numerics = Numerics(cell_size_mm=size_mm, refine=refine)
+        field = simulate_case(vessel_case(vessel, FlowSettings(inflow_mL_s=0.6, numerics=numerics)))
+        return np.asarray(sampling.values_at(field, on_axis_mm)[0][:, 2], dtype=np.float64)
+
+    np.testing.assert_allclose(speeds_m_s(0.13, "inlet"), speeds_m_s(0.13), rtol=0.005)
+
+
 def test_a_ball_without_blood_is_refused() -> None:
     beside = Numerics(cell_size_mm=0.2, refine=((4.0, 0.0, 12.0, 1.9),))
     case = vessel_case(tube(line(24.0), RADIUS_MM).vessel, FlowSettings(numerics=beside))

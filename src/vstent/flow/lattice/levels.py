@@ -72,6 +72,8 @@ UPSTREAM_DIAMETERS, DOWNSTREAM_DIAMETERS = 5.0, 1.0
 """Extent of the refined part from the sac towards the inlet and the outlets, in mean diameters 4 V / A of the vessel.
 The flow into the sac forms upstream: beside the same spacing everywhere (0.14 mm) the demo's neck inflow is 2 % lower
 with one diameter, 1 % lower with two, 3 % higher with three and 2 % higher with five."""
+JET_DIAMETERS: Final = 5.0
+"""Radius of the refined part around an inlet, in its diameters."""
 BESIDE_NECK: Final = 0.5
 """Distance in neck diameters from the nearest wire outside the sac up to which wires are walls on finer levels. Beyond,
 they are a screen. Neck inflow at a fork (T) is 2 % higher than with all wires as walls; with a quarter it is 5 %."""
@@ -185,7 +187,9 @@ def near_sac(case: FlowCase, grid: Domain) -> Bools:
 
 def _balls(case: FlowCase, size_mm: float) -> Floats:
     """Return centers and radii (b, 4) of the balls to be refined, each wide enough for a cell of this size."""
-    balls = np.array([one for one in case.numerics.refine if not isinstance(one, str)], dtype=float).reshape(-1, 4)
+    refine, inlets = case.numerics.refine, case.vessel.inlets
+    jets = [(*one.center_mm, JET_DIAMETERS * one.diameter_mm) for one in inlets if "inlet" in refine]
+    balls = np.array([*jets, *(one for one in refine if not isinstance(one, str))], dtype=float).reshape(-1, 4)
     away_mm = case.vessel.closed.signed_distance(balls[:, :3])
     for x, y, z, radius_mm in balls[away_mm >= balls[:, 3]]:
         raise FlowError(
@@ -239,8 +243,8 @@ def _reach_mm(case: FlowCase, size_mm: float, finest_mm: float) -> float:
     if case.has_screen:
         own_mm = SCREEN_CELLS * size_mm
     else:
-        assert case.wires is not None
-        own_mm = thickness_mm(case.wires)
+        assert case.walls is not None
+        own_mm = thickness_mm(case.walls)
     return own_mm + MARGIN_CELLS * max(0.0, size_mm - WIDTH * finest_mm)
 
 
@@ -253,13 +257,14 @@ def _around(case: FlowCase) -> Surface:
     if case.has_screen:
         assert case.ostium is not None
         return case.ostium
-    assert case.wires is not None
+    walls = case.walls
+    assert walls is not None
     if case.sac is None or case.ostium is None:
-        return case.wires
-    away_mm = case.sac.signed_distance(case.wires.corners_mm.mean(axis=1))
+        return walls
+    away_mm = case.sac.signed_distance(walls.corners_mm.mean(axis=1))
     nearest_mm = np.min(away_mm, where=away_mm > 0, initial=inf)  # coils in the sac are nearer than a device beside it
     is_near = away_mm <= nearest_mm + BESIDE_NECK * neck_diameter_mm(case.ostium)
-    return Surface(case.wires.vertices_mm, case.wires.faces[is_near])
+    return Surface(walls.vertices_mm, walls.faces[is_near])
 
 
 def beside_walls(case: FlowCase, blood_mm: Floats) -> FlowCase:
@@ -267,7 +272,7 @@ def beside_walls(case: FlowCase, blood_mm: Floats) -> FlowCase:
 
     The bands of wires reach beyond the border of a finer level, where they would resist once more.
     """
-    wires, tree = case.wires, cKDTree(blood_mm)
+    wires, tree = case.walls, cKDTree(blood_mm)
     assert wires is not None
 
     def left(sheet: Sheet) -> Sheet:
@@ -373,8 +378,8 @@ def around_wires_mm(case: FlowCase) -> float:
     Walls need cells across a wire, and a screen `cells_across_neck`.
     """
     numerics = case.numerics
-    if numerics.wires == "resolved" and case.wires is not None:
-        return domains.around_walls_mm(case.wires)
+    if case.walls is not None:
+        return domains.around_walls_mm(case.walls)
     if case.has_screen and case.ostium is not None and numerics.cell_size_mm is None:
         return neck_diameter_mm(case.ostium) / max(numerics.cells_across_neck, 1e-9)
     return inf
