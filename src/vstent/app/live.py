@@ -21,6 +21,7 @@ from vstent.devices.stent import Stent
 from vstent.errors import InputError, VstentError
 from vstent.flow.case import FlowCase
 from vstent.flow.settings import FlowSettings
+from vstent.flow.streamlines import neck_seeds_mm
 from vstent.geometry.vessel import Anatomy
 from vstent.io.archive import DAMAGE
 from vstent.reporting.packing import message
@@ -350,8 +351,6 @@ class _Worker:
         self.reading = Reading(self.serial, 1.0, values, points, now.is_settled, self.live.is_prepared)
         self.pipe.send(self.reading)
         if time.monotonic() - self.drawn_s > (LINES_S if points else 3 * LINES_S):
-            from vstent.flow.streamlines import neck_seeds_mm
-
             flow, self.drawn_s = self.live.field(), time.monotonic()
             seeds_mm = neck_seeds_mm(flow, self.anatomy.aneurysms[0].neck, LINES)
             self.pipe.send(replace(self.reading, lines=stream_layer("", flow, seeds_mm)))

@@ -15,11 +15,13 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, Final
 
+from vstent.angiography.angiogram import AngiogramSettings
 from vstent.app.cases import Case, State
 from vstent.errors import VstentError
 from vstent.study.keys import ANATOMY, anatomy_keys, hash_of
-from vstent.study.pipeline import run
+from vstent.study.pipeline import deploy_treatments, restore_vessel, run
 from vstent.study.progress import Progress
+from vstent.study.stages import ask_for_aneurysm
 
 WINDOW_S: Final = 8.0
 """Time that the angiogram of the page covers, in s: five seconds after the peak of the usual injection, and more."""
@@ -46,9 +48,6 @@ def progress(now: Progress) -> None:
 
 def find_anatomy(case: Case) -> None:
     """Find vessel, sac, neck and parent artery; VesselError is raised where the user must say where the sac is."""
-    from vstent.study.pipeline import restore_vessel
-    from vstent.study.stages import ask_for_aneurysm
-
     settings = case.state.settings()
     anatomy, _ = restore_vessel(case.input, case.folder, settings, progress, replaces=True)
     tell(anatomy=_anatomy_key(case))
@@ -57,8 +56,6 @@ def find_anatomy(case: Case) -> None:
 
 def place_implants(case: Case) -> None:
     """Deploy the chosen treatments with their coils, and store them for the page and the flow."""
-    from vstent.study.pipeline import deploy_treatments
-
     deploy_treatments(case.input, case.folder, case.state.settings(), progress, replaces=True)
 
 
@@ -81,7 +78,6 @@ def compute(case: Case) -> None:
 
 def carry_contrast(case: Case) -> None:
     """Carry contrast through the flows, film it, and write the report again."""
-    from vstent.angiography.angiogram import AngiogramSettings
     from vstent.angiography.filming import FilmSettings
     from vstent.reporting.film_case import film_case, write_report_again
 

@@ -8,15 +8,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from vstent.app import intake
 from vstent.app.cases import STATE, STEPS, Case, Cases, dependencies, failures, statuses
 from vstent.app.choices import pulse_of
 from vstent.app.finished import REPORT, are_flows_stored, kept_histories, lost_steps, reopened, shown_flows
 from vstent.app.jobs import KINDS, RANKING, Jobs
+from vstent.devices.catalogue import baskets, catalogue
 from vstent.devices.treatment import BARE, Treatment
 from vstent.errors import InputError, ReadError
-from vstent.io.files import existing, state_of, suffix, write_bytes
-from vstent.study.folder import RUN
+from vstent.flow.settings import FlowSettings
+from vstent.io.files import RAW_SUFFIXES, existing, is_surface_file, state_of, suffix, write_bytes
+from vstent.study.folder import CACHE, RUN
 
 PICTURE: Final = ".picture.png"
 """File of a case folder with its picture in the list of cases."""
@@ -204,8 +208,6 @@ class Workspace:
         Raises InputError: the vessel has no sac.
         """
         from vstent.app.live import BareFlowStore, LiveFlowProcess
-        from vstent.flow.settings import FlowSettings
-        from vstent.study.folder import CACHE
 
         preview, state = self.preview(case), case.state
         given = state.settings().flow or FlowSettings()
@@ -248,8 +250,6 @@ class Workspace:
 
         Raises InputError: the case has a surface, or no input yet.
         """
-        import numpy as np
-
         from vstent.app.scans import Scan
         from vstent.io.images import read_image
 
@@ -360,8 +360,6 @@ def begin_upload(case: Case, name: str) -> Path:
 
 def devices() -> list[dict[str, Any]]:
     """Return the catalogue with baskets and coils as the page lists it."""
-    from vstent.devices.catalogue import baskets, catalogue
-
     return [
         {
             "key": key,
@@ -392,10 +390,6 @@ def pulse(case: Case | None) -> dict[str, Any]:
 
     It is the published waveform, or that of the study that the case was opened from.
     """
-    import numpy as np
-
-    from vstent.flow.settings import FlowSettings
-
     former = None if case is None else case.state.former_settings().flow
     waveform = pulse_of(former or FlowSettings())
     time_s = np.linspace(0.0, waveform.period_s, 101)
@@ -415,14 +409,10 @@ def _titles(metrics: dict[str, Any], case: Case) -> dict[str, str]:
 
 def _is_surface(case: Case) -> bool:
     """Return whether the input of a case is a surface."""
-    from vstent.io.files import is_surface_file
-
     return is_surface_file(case.input)
 
 
 def _wants_grid(case: Case) -> bool:
     """Return whether number and spacing of the voxels must be given before the scan can be read."""
-    from vstent.io.files import RAW_SUFFIXES
-
     choices = case.state.choices
     return suffix(case.input) in RAW_SUFFIXES and (choices.shape is None or choices.spacing_mm is None)

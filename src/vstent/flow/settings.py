@@ -146,8 +146,8 @@ class Numerics:
     refine: tuple[Region, ...] = setting(
         (),
         "refine",
-        "where the grid is refined: with sac (and the artery near it), inlet (and its jet) or a ball X,Y,Z,R the grid "
-        "spacing holds only there, and twice it elsewhere; with branches, those of fewer than six cells across have down to a quarter",
+        "where the grid is refined: with sac (and artery near it), inlet (and its jet) or a ball X,Y,Z,R the spacing "
+        "holds only there, and twice it elsewhere; with branches, those below six cells across have down to a quarter",
         read_region,
         POSITION,
         metavar="WHERE",

@@ -275,7 +275,8 @@ class _Runs:
             return self._calibrated(case, start)
         if case.walls is not None and self.engine.has_levels:
             as_screen = replace(self, progress=self._part(0.0, SCREEN_SHARE))
-            begun = partial(as_screen.answer, _with_wires(case, "screen"), start)
+            screen = replace(case, numerics=replace(case.numerics, wires="screen", cells_across_neck=0.0))
+            begun = partial(as_screen.answer, screen, start)
             return self._run("resolved", case, default_cell_size_mm(case), begun, (SCREEN_SHARE, 1.0))
         sizes_mm, coarsening = [default_cell_size_mm(case)], self.engine.coarsening
         one_level = replace(case.numerics, refine=(), cells_across_neck=0.0)
@@ -320,10 +321,10 @@ class _Runs:
         if case.waveform is not None:  # a pulse begins with a phase of the one before, and converges in fewer cycles
             similar = self.similar
         last = replace(self, prefix="calibrated ", progress=self._part(1 - 1 / runs, 1.0), similar=similar)
-        field = last.answer(calibration.scaled(case, factor), start)
-        remark = f"calibrated: it resists {factor:.3g} times as much."
-        if all(of_screen == of_walls for _, of_screen, of_walls in rounds):
-            remark = "not calibrated: the force on its wires is not proportional to the flow through them."
+        remark = "not calibrated: the force on its wires is not proportional to the flow through them."
+        if calibration.is_known(rounds):
+            case, remark = calibration.scaled(case, factor), f"calibrated: it resists {factor:.3g} times as much."
+        field = last.answer(case, start)
         return replace(field, advice=f"{field.advice} The screen is {remark}")
 
     def _bare(self, name: str, case: FlowCase, size_mm: float, finer: Guess, part: Part) -> FlowField | None:

@@ -204,7 +204,7 @@ def test_a_tile_lies_in_the_middle_of_a_narrow_neck_where_most_blood_passes(brai
 
 
 def test_a_screen_whose_resistance_cannot_be_read_off_stays(braided: FlowCase, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a tile that diverged, force and velocity are nan."""
+    """Of a tile that diverged, force and velocity are nan. Beside blood that passes a tile, no factor is found."""
     case = with_numerics(braided, cells_per_diameter=8.0, cells_across_neck=0.0, max_steps=100)
     screen = simulate_case(case)
     center_mm = calibration.strongest_mm(case, screen)
@@ -213,7 +213,19 @@ def test_a_screen_whose_resistance_cannot_be_read_off_stays(braided: FlowCase, m
         rounds = [(1.0, *calibration.read_off(case, case, screen, center_mm))]
         assert calibration.next_factor(rounds) == 1.0
         assert calibration.next_factor([(0.8, 2.0, 1.5), (0.9, *rounds[0][1:])]) == 0.9
-    assert "The screen is not calibrated: the force" in simulate_case(with_numerics(case, wires="calibrated")).advice
+    of_wires, scaled, factors = {"screen": (1.0, 1.0), "resolved": (2.0, 1.0)}, calibration.scaled, list[float]()
+
+    def watched(case: FlowCase, factor: float) -> FlowCase:
+        factors.append(factor)
+        return scaled(case, factor)
+
+    monkeypatch.setattr(calibration, "scaled", watched)
+    for found_there in (lambda *_: (np.nan, np.nan), lambda case, *_: of_wires[case.numerics.wires]):
+        monkeypatch.setattr(calibration, "_resistance", found_there)
+        assert (
+            "The screen is not calibrated: the force" in simulate_case(with_numerics(case, wires="calibrated")).advice
+        )
+    assert len(factors) == 2 * calibration.ROUNDS, "the last flow has the screen as it is"
 
 
 def test_the_runs_of_a_calibrated_flow_are_stored_apart_from_those_with_the_screen_as_it_is(

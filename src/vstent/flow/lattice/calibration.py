@@ -53,6 +53,9 @@ RESPONSE: Final = 0.8
 through the edge of the averages (Silk, from half to the whole 0.81, from twice to the whole 0.77)."""
 LIKE_FLOW: Final = 0.9
 """Least correlation of force and velocity with which the resistance counts as known."""
+MOST_APART: Final = 1.3
+"""Largest ratio of what the screen and the wires resist in the last round (arc, T and tee: 1.1). Where a device is
+crumpled in a narrow artery, the averages contain blood that passes beside it."""
 
 
 def suits(case: FlowCase) -> bool:
@@ -103,6 +106,13 @@ def next_factor(rounds: Sequence[tuple[float, float, float]]) -> float:
     if len(rounds) > 1 and factor != rounds[-2][0]:
         response = min(max(log(of_screen / rounds[-2][1]) / log(factor / rounds[-2][0]), 0.5), 1.0)
     return float(factor * (of_walls / of_screen) ** (1 / response))
+
+
+def is_known(rounds: Sequence[tuple[float, float, float]]) -> bool:
+    """Return whether rounds (factor, of screen, of walls) ended near what the wires resist, read off at least once."""
+    _, of_screen, of_walls = rounds[-1]
+    was_read = any(screen != walls for _, screen, walls in rounds)
+    return was_read and 1 / MOST_APART < of_walls / of_screen < MOST_APART
 
 
 def scaled(case: FlowCase, factor: float) -> FlowCase:
