@@ -35,7 +35,7 @@ from vstent.geometry.vessel import Anatomy
 from vstent.units import duration
 
 SCREEN_SHARE = 0.15
-"""Share of the run time of the flow with a screen, from which one with resolved wires begins (measured: 0.1 to 0.2)."""
+"""Share of the run time of the flow with a screen, from which one with resolved wires begins (T 0.07, beta 0.2)."""
 ROUND_SHARE = 0.6
 """Assumed share of the run time of the flow in a round of a calibration; the rest is that of the tile."""
 COARSE_SHARE = 0.12
