@@ -263,7 +263,7 @@ class _Runs:
     similar: FlowField | None = None
     """Flow with a similar stent, from which the whole vessel starts."""
     prefix: str = ""
-    """Begin of the names of runs, which differ from those with the screen as it is where it is calibrated."""
+    """Begin of the names of runs that must not be continued as those with the screen as it is."""
 
     def answer(self, case: FlowCase, start: FlowField | None) -> FlowField:
         """Compute a flow from a first guess on coarser grids, each of which starts from the next coarser one.
@@ -274,7 +274,7 @@ class _Runs:
         if case.numerics.wires == "calibrated" and self.engine.has_levels:
             return self._calibrated(case, start)
         if case.walls is not None and self.engine.has_levels:
-            as_screen = replace(self, progress=self._part(0.0, SCREEN_SHARE))
+            as_screen = replace(self, prefix="screen ", progress=self._part(0.0, SCREEN_SHARE))
             screen = replace(case, numerics=replace(case.numerics, wires="screen", cells_across_neck=0.0))
             begun = partial(as_screen.answer, screen, start)
             return self._run("resolved", case, default_cell_size_mm(case), begun, (SCREEN_SHARE, 1.0))

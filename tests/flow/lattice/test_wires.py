@@ -15,6 +15,7 @@ from vstent.flow.indices import indices
 from vstent.flow.lattice import levels, stepping
 from vstent.flow.lattice.cost import estimate, refuse_too_large
 from vstent.flow.lattice.engine import LatticeBoltzmann
+from vstent.flow.lattice.levels import sizes_mm
 from vstent.flow.lattice.reading import exchanged, force_N
 from vstent.flow.lattice.state import State
 from vstent.flow.settings import FlowSettings, Numerics
@@ -195,6 +196,28 @@ def test_wires_on_a_finer_level_are_those_of_the_uniform_fine_grid(
     between = state.interface
     assert between is not None
     assert np.abs(between.lack).max() < 1e-4
+
+
+def test_walls_begin_from_a_screen_on_one_level_that_is_stored_apart(resolved: FlowCase) -> None:
+    """A stored flow with the screen as it is has a finer level around the neck: it must not be continued as that."""
+    names: list[str] = []
+
+    class Names:
+        def load(self, run: str) -> None:
+            names.append(run)
+
+        def save(self, run: str, saved: object) -> None: ...
+
+    numerics = Numerics(cells_per_diameter=12.0, wires="resolved", max_steps=100)
+    case = replace(resolved, numerics=numerics)
+    assert len(sizes_mm(replace(case, numerics=replace(numerics, wires="screen")), 2 * CELL_MM)) == 2
+    began: list[int] = []
+    with pytest.MonkeyPatch.context() as patch:
+        init = LatticeBoltzmann.init
+        patch.setattr(LatticeBoltzmann, "init", lambda *of: (began.append(len((state := init(*of)).levels)), state)[1])
+        simulate_case(case, checkpoint=Names())
+    assert [name for name in names if "guess" not in name] == ["resolved", "screen answer"]
+    assert began[-2:] == [1, 2]
 
 
 @pytest.mark.validation
