@@ -44,7 +44,7 @@ COARSE_SHARE = 0.12
 QUICK_S = 600.0
 """Expected run time up to which wires are resolved or calibrated where that is left to the program."""
 USUAL_PART = 1 / 2
-"""Usual part of the most that a flow may take: flows with walls took 0.3 (demo, tee) to 0.8 of it (arc, T)."""
+"""Usual part of the most that a flow may take: flows with walls took 0.3 (demo, tee) to 0.95 of it (beta)."""
 
 CALMER_TRIES = 3
 """Maximum number of retries of a diverged run, each with a shorter time step."""
@@ -130,7 +130,7 @@ def simulate_case(
     """
     if case.media or case.solids:
         case = _resisted(case, start)
-    case, remark = _decided(case)
+    case, remark = _decided(case, start)
     with nullcontext(folder) if folder is not None else TemporaryDirectory(prefix="vstent-") as own:
         field = _Runs(_engine_of(case), Path(own), progress, checkpoint, similar).answer(case, start)
     return replace(field, advice=field.advice + remark) if remark else field
@@ -141,21 +141,25 @@ def _with_wires(case: FlowCase, wires: Wires) -> FlowCase:
     return replace(case, numerics=replace(case.numerics, wires=wires))
 
 
-def _decided(case: FlowCase) -> tuple[FlowCase, str]:
-    """Return a case with its wires as walls or as a screen where that is open, and a sentence with the reason."""
+def _decided(case: FlowCase, start: FlowField | None = None) -> tuple[FlowCase, str]:
+    """Return a case with its wires as walls or as a screen where that is open, and a sentence with the reason.
+
+    Where the flow to start from is unsteady, averages need all the time steps.
+    """
     are_coils = any(isinstance(one, Coils) for one in case.solids)  # their indices are those of a porous region
     if case.numerics.wires != "auto" or case.numerics.engine != LATTICE or case.wires is None or are_coils:
         return (_with_wires(case, "screen") if case.numerics.wires == "auto" else case), ""
     if case.numerics.device_gpu:
         require_gpu()
     resolved, screen = _with_wires(case, "resolved"), _with_wires(case, "screen")
+    usual_part = USUAL_PART if start is None or start.finest.mean_speed_m_s is None else 1.0
     cost = estimate(resolved)
-    how = f"resolving them would take about {duration(USUAL_PART * cost.seconds)} and {cost.memory_bytes / 1e9:.2g} GB."
-    if USUAL_PART * cost.seconds < QUICK_S and fits(resolved):
+    how = f"resolving them would take about {duration(usual_part * cost.seconds)} and {cost.memory_bytes / 1e9:.2g} GB."
+    if usual_part * cost.seconds < QUICK_S and fits(resolved):
         return resolved, ""
     if calibration.suits(case):
         of_tiles_s, of_tile_bytes = calibration.cost(case)
-        seconds = of_tiles_s + calibration.ROUNDS * USUAL_PART * estimate(screen).seconds
+        seconds = of_tiles_s + calibration.ROUNDS * usual_part * estimate(screen).seconds
         if seconds < QUICK_S and of_tile_bytes < free_memory_bytes():
             return _with_wires(case, "calibrated"), f" The wires are a calibrated screen: {how}"
         how += f" Calibrating them would take about {duration(seconds)}."

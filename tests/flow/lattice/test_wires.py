@@ -252,3 +252,10 @@ def test_open_wires_are_decided_by_time_and_the_reason_is_told(
     assert chosen.numerics.wires == "screen"
     assert f"The wires are a screen: resolving them would take about {duration(seconds)}" in reason
     assert reason in simulation.foretell_cost(is_open)
+    bare = replace(is_open, media=(), solids=(), numerics=Numerics(cell_size_mm=0.3, max_steps=96))
+    unsteady = simulate_case(bare)
+    assert unsteady.finest.mean_speed_m_s is not None
+    steady = replace(unsteady, levels=(replace(unsteady.finest, mean_speed_m_s=None),))
+    monkeypatch.setattr(simulation, "QUICK_S", seconds + 1.0)
+    chosen = [simulation._decided(is_open, start)[0].numerics.wires for start in (steady, unsteady)]
+    assert chosen == ["resolved", "screen"]
