@@ -431,6 +431,19 @@ def test_the_grid_spacing_holds_in_a_ball_and_twice_it_elsewhere() -> None:
     assert len(LatticeBoltzmann(0.2).init(both, None).levels[1].domain.cells) > len(fine.cells)
 
 
+def test_a_ball_that_reaches_no_wall_is_refined_and_changes_no_flow() -> None:
+    vessel, at_mm = tube(line(9.0), 4.0).vessel, np.array([[0.0, 0.0, 4.5], [0.7, 0.0, 4.5], [2.0, 0.0, 4.5]])
+
+    def case_with(*refine: Region) -> FlowCase:
+        numerics = Numerics(cell_size_mm=0.3, refine=refine)
+        return vessel_case(vessel, FlowSettings(inflow_mL_s=3.0, numerics=numerics))
+
+    whole, refined = case_with(), case_with((0.0, 0.0, 4.5, 0.5))
+    assert not len(LatticeBoltzmann(0.3).init(refined, None).levels[1].domain.link_cell)
+    speeds_m_s = [sampling.values_at(simulate_case(case), at_mm)[0][:, 2] for case in (whole, refined)]
+    np.testing.assert_allclose(*speeds_m_s, rtol=0.01)
+
+
 def test_a_jet_from_a_narrow_inlet_is_that_of_the_fine_grid() -> None:
     """From 1.6 to 4 mm: twice the grid spacing everywhere has a jet that is 7 % slower at the end of the tube."""
     path = line(9.0)

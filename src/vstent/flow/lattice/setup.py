@@ -91,7 +91,7 @@ class Grid:
         """Order (l,) of links that reads memory in sequence: ends by cell, then the wall by layer and direction."""
         domain = self.domain
         is_wall = domain.link_patch == 0
-        patch = np.where(is_wall, domain.link_patch.max() + 1, domain.link_patch)
+        patch = np.where(is_wall, domain.link_patch.max(initial=0) + 1, domain.link_patch)
         keys = domain.link_direction, domain.cells[domain.link_cell, 0]
         return np.lexsort((domain.link_cell, *(np.where(is_wall, key, 0) for key in keys), patch))
 
