@@ -196,7 +196,7 @@ def test_a_header_and_the_voxels_that_it_names_are_one_scan(tmp_path):
     [
         ("/api/cases/unheard-of", 404, "This case does not exist."),
         ("/assets/unheard-of", 404, "This file does not exist."),
-        ("{case}/section?abscissa_mm=nan", 422, "finite"),
+        ("{case}/flow?cut_mm=nan", 422, "finite"),
         ("{case}/image/surface?threshold=inf", 422, "finite"),
     ],
 )
@@ -327,9 +327,7 @@ def test_deployed_numbers_are_those_of_the_measures(client, case, workspace):
 def test_the_section_has_the_phantoms_radius(client, case, workspace):
     start, _ = app_case.opened(client.post(f"{case}/sketch", json=wanted(SILK)))
     place = start["ends_mm"][0] + 1.0
-    section = client.get(
-        f"{case}/section", params={"abscissa_mm": place, "treatment": "silk", "implant": "silk"}
-    ).json()
+    section = client.post(f"{case}/section", json={"abscissa_mm": place, "treatment": SILK, "implant": "silk"}).json()
     segments = np.array(section["landing"]).reshape(-1, 2, 2)
     near = np.linalg.norm(segments, axis=2).max(axis=1) < section["artery_diameter_mm"]
     length = np.linalg.norm(segments[near, 1] - segments[near, 0], axis=1).sum()
@@ -492,7 +490,7 @@ def test_a_basket_is_deployed_measured_and_moved_along_the_axis_of_the_sac(clien
         assert answer[0]["ends_mm"][0] == pytest.approx(there.stent.proximal_abscissa_mm, abs=1e-6)
         np.testing.assert_allclose(wires_of(*answer, "web_sl")[0], there.stent.wire_points_mm, atol=2e-3)
     assert client.post(f"{case}/bands", json=wanted(web)).json()["rows"] == []
-    section = client.get(f"{case}/section", params={"abscissa_mm": 2.0, "treatment": "web_sl"}).json()
+    section = client.post(f"{case}/section", json={"abscissa_mm": 2.0, "treatment": web}).json()
     assert (section["rings"], "device_diameter_mm" in section) == ([], False)
     assert client.get(f"{case}/plan.pdf").content.count(b"/MediaBox") == 1
     refused = client.post(f"{case}/jobs/rank")
@@ -553,7 +551,7 @@ def test_stents_at_a_fork_are_shown_and_moved_on_their_own_paths(client, tmp_pat
     assert sketched["ends_mm"][0] == pytest.approx(at_mm, abs=0.3)
     wires_mm = [wires_of(*answer, both["name"])[0] for answer in ((told, raw), (sketched, moved))]
     np.testing.assert_allclose(wires_mm[0], wires_mm[1], atol=4e-3)
-    section = client.get(f"{case}/section", params={"abscissa_mm": 8.0, "treatment": both["name"]}).json()
+    section = client.post(f"{case}/section", json={"abscissa_mm": 8.0, "treatment": both}).json()
     assert section["rings"] == []  # it is across the parent artery
     assert client.post(f"{case}/bands", json=wanted(both, implant=first)).status_code == 200
 
@@ -564,18 +562,19 @@ def test_a_section_through_two_implants_has_both_and_the_diameters_of_one(client
     both_mm = told["ends_mm"][1] - 1.0  # the outer one reaches further
     widths = []
     for implant in ("outer", "inner"):
-        query = {"abscissa_mm": both_mm, "treatment": "two", "implant": implant}
-        section = client.get(f"{case}/section", params=query).json()
+        query = {"abscissa_mm": both_mm, "treatment": TWO, "implant": implant}
+        section = client.post(f"{case}/section", json=query).json()
         assert len(section["rings"]) == 2
         widths.append(section["device_diameter_mm"])
     assert widths[1] < widths[0] - 0.1  # by two wires
-    query = {"abscissa_mm": told["ends_mm"][0] + 1.0, "treatment": "two", "implant": "outer"}
-    section = client.get(f"{case}/section", params=query).json()
+    query = {"abscissa_mm": told["ends_mm"][0] + 1.0, "treatment": TWO, "implant": "outer"}
+    section = client.post(f"{case}/section", json=query).json()
     assert (len(section["rings"]), "device_diameter_mm" in section) == (1, False)
     sheet = client.post(f"{case}/bands", json=wanted(TWO, implant="inner")).json()
     assert (sheet["treatment"], sheet["implant"]) == ("two", "inner")
     assert client.get(f"{case}/plan.pdf").content.count(b"/MediaBox") == 2
     choose(client, case, treatments=[SILK])
+    assert client.post(f"{case}/section", json=query).json() == section  # asked for while another choice is stored
 
 
 def test_flows_of_the_best_sizes_join_a_ranking_that_is_there_before(artery, tmp_path, monkeypatch):

@@ -1,6 +1,6 @@
 // An implant on its axis: handles at its ends that slide along it, the device that follows, the cursor of the section.
 import { make } from "../src/dom.js";
-import { get, Newest, post, postBinary } from "./api.js";
+import { Newest, post, postBinary } from "./api.js";
 import { Axis } from "./axis.js";
 import { label, makeHandle } from "./handles.js";
 import { heightWords, reachOf, reachWords } from "./numbers.js";
@@ -129,8 +129,7 @@ export class Deploying {
     this.cursor = mm;
     this.page.along.set({ cursor: mm });
     this.page.picture.stage?.redraw();
-    const query = new URLSearchParams({ abscissa_mm: mm.toFixed(3) });
-    if (this.wantedNow() && !this.isDragging) for (const [key, value] of [["treatment", this.name], ["implant", this.id]]) query.set(key, value);
-    this.sections.ask(() => get(`${this.page.path}/section?${query}`));
+    const wanted = { ...(!this.isDragging && this.wantedNow()), abscissa_mm: Number(mm.toFixed(3)) };
+    this.sections.ask(() => post(`${this.page.path}/section`, wanted));
   }
 }

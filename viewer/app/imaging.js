@@ -66,7 +66,7 @@ export class Imaging {
     this.slices.setCrop(crop_mm);
     const treatment = view.steps.deploy === "done" ? treatments[0] : null;
     this.slices.hasSac = Boolean(this.page.anatomy?.neck.length);
-    this.slices.setFound(view.has_anatomy ? view.anatomy : null, treatment?.name ?? null, treatment && JSON.stringify(treatment));
+    this.slices.setFound(view.has_anatomy ? view.anatomy : null, treatment ?? null);
     const crop = JSON.stringify(crop_mm);
     if (this.cropKey !== undefined && crop !== this.cropKey) {
       this.page.scan.proposed_threshold = undefined;

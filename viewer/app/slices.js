@@ -1,7 +1,7 @@
 // Three linked slices of a scan: one cross-hair, one window, one zoom; tools for window and level, ruler, seed and crop box.
 import { make } from "../src/dom.js";
 import { integers, numbers } from "../src/decode.js";
-import { getBinary, Newest } from "./api.js";
+import { getBinary, Newest, postBinary } from "./api.js";
 import { SliceBar } from "./slicebar.js";
 import { pathOf, SliceView } from "./sliceview.js";
 import { Handling } from "./slicetools.js";
@@ -57,11 +57,6 @@ export class Slices {
     this.setSeed(this.seedMm);
     this.put(toIndex(this.scan.affine_mm, point));
     this.setTool(isUpright && tool === "crop" ? "cross" : tool);
-  }
-
-  /** Which grid the server is asked for. */
-  get asked() {
-    return this.isUpright ? "&upright=true" : "";
   }
 
   /** Show the slices through a point of the world, unless somebody has turned to others. */
@@ -138,7 +133,7 @@ export class Slices {
     const { scan } = this;
     let plane = this.kept.get(key);
     if (!plane) {
-      const { manifest, buffer } = await getBinary(`${this.page.path}/image/slice?axis=${view.axis}&index=${index}&slab=${this.slabOf(view)}${this.asked}`);
+      const { manifest, buffer } = await getBinary(`${this.page.path}/image/slice?axis=${view.axis}&index=${index}&slab=${this.slabOf(view)}&upright=${this.isUpright}`);
       plane = { width: manifest.width, height: manifest.height, values: integers(buffer, manifest.values) };
       if (scan !== this.scan) return null;
       this.keep(key, plane);
@@ -169,9 +164,9 @@ export class Slices {
     this.bar.say();
   }
 
-  /** The anatomy that was found, and the name and places of a treatment in it: their outlines are drawn from here on. */
-  setFound(anatomy, treatment, places) {
-    const found = anatomy ? [anatomy, treatment, places].join(" ") : null;
+  /** The anatomy that was found, and a treatment in it: their outlines are drawn from here on. */
+  setFound(anatomy, treatment) {
+    const found = anatomy ? [anatomy, JSON.stringify(treatment)].join(" ") : null;
     if (found === this.found) return;
     this.found = found;
     this.treatment = treatment;
@@ -194,10 +189,10 @@ export class Slices {
     if (!this.found) return;
     const [index, { outlineKey: found, treatment }] = [view.index, this];
     if (view.outlines?.index === index && view.outlines.found === found) return;
-    const wires = treatment && this.on.wires ? `&treatment=${encodeURIComponent(treatment)}` : "";
+    const wanted = { axis: view.axis, index, treatment: this.on.wires ? treatment : null, upright: this.isUpright };
     this.outlineLines[view.axis].ask(async () => {
       if (index !== view.index) return null;
-      return { view, index, found, answer: await getBinary(`${this.page.path}/image/outlines?axis=${view.axis}&index=${index}${wires}${this.asked}`) };
+      return { view, index, found, answer: await postBinary(`${this.page.path}/image/outlines`, wanted) };
     });
   }
 

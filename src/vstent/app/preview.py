@@ -121,16 +121,6 @@ class Preview:
             raise ReadError("The vessel has not been found yet. Run the first three steps.")
         return self._cached(("anatomy", key), lambda: load_data(path, Anatomy))
 
-    def choice(self, name: str) -> Treatment:
-        """Return a chosen treatment by its name.
-
-        Raises ReadError: it is not chosen.
-        """
-        for treatment in self.case.state.choices.treatments:
-            if treatment.name == name:
-                return treatment
-        raise ReadError(f"{name} is not among the chosen treatments.")
-
     def _wall(self, treatment: Treatment, implant: Implant) -> MeasuredWall:
         """Return the artery, with the implants inside which it opens, prepared for an implant of the chosen size."""
         path, asked = implant.placing.path, (implant.device, implant.diameter_mm, implant.length_mm)
@@ -572,10 +562,10 @@ class Preview:
             curves = kept_curves(self.case.folder) if moment is None else None
             return films_message(histories, angles, stents=stents, moment=moment, curves=curves)
 
-    def section(self, name: str | None, implant: str | None, abscissa_mm: float) -> dict[str, Any]:
+    def section(self, treatment: Treatment | None, implant: str | None, abscissa_mm: float) -> dict[str, Any]:
         """Return the section by a plane across the parent axis: curves in the plane, in mm, and diameters.
 
-        It shows the treatment of a name, where one is given, with the diameters of one implant, or else of the first.
+        It shows a treatment, where one is given, with the diameters of one implant, or else of the first.
         """
         with LOCK:
             anatomy = self.anatomy
@@ -589,7 +579,7 @@ class Preview:
                 "lumen": _section(anatomy.vessel.lumen, center, frame),
                 "landing": _section(anatomy.parent.landing_surface, center, frame),
             }
-            deployed: dict[str, Deployment] = {} if name is None else self.deployed(self.placed(self.choice(name)))
+            deployed = {} if treatment is None else self.deployed(self.placed(treatment))
             if not deployed:
                 return shown
             shown["rings"], shown_id = [], implant if implant in deployed else next(iter(deployed))

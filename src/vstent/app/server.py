@@ -81,6 +81,23 @@ class SketchWanted(ImplantWanted):
     abscissa_mm: float | None = Field(default=None, ge=-1000, le=1000)
 
 
+class OutlinesWanted(Strict):
+    """A slice, and a treatment whose wires are drawn on it."""
+
+    axis: int = Field(ge=0, le=2)
+    index: int
+    treatment: Treatment | None = None
+    upright: bool = False
+
+
+class SectionWanted(Strict):
+    """A place on the parent axis, and a treatment that the section shows, with the diameters of one implant."""
+
+    abscissa_mm: float = Field(ge=-1000, le=1000)
+    treatment: Treatment | None = None
+    implant: str | None = Field(default=None, max_length=60)
+
+
 class ComparisonWanted(Strict):
     """Treatments to draw side by side."""
 
@@ -286,11 +303,9 @@ def _add_input(api: APIRouter, work: Workspace, of_case: Any) -> None:
     ) -> Response:
         return Binary(work.scan(case).slice(axis, index, slab, is_upright=upright))
 
-    @api.get("/api/cases/{case_id}/image/outlines", summary="Sections of vessel, sac, neck and wires (binary)")
-    def outlines(
-        axis: Axis, index: int, treatment: str | None = None, upright: bool = False, case: Case = of_case
-    ) -> Response:
-        return Binary(work.outlines(case, treatment, axis, index, is_upright=upright))
+    @api.post("/api/cases/{case_id}/image/outlines", summary="Sections of vessel, sac, neck and wires (binary)")
+    def outlines(wanted: OutlinesWanted, case: Case = of_case) -> Response:
+        return Binary(work.outlines(case, wanted.treatment, wanted.axis, wanted.index, is_upright=wanted.upright))
 
     @api.get("/api/cases/{case_id}/image/surface", summary="The surface at a threshold (binary)")
     def surface(threshold: Finite, case: Case = of_case) -> Response:
@@ -361,11 +376,9 @@ def _add_scenes(api: APIRouter, work: Workspace, of_case: Any) -> None:
     def bands(wanted: ImplantWanted, case: Case = of_case, gaps: bool = False) -> dict[str, Any]:
         return dict(work.preview(case).bands_sheet(wanted.treatment, wanted.implant, has_gaps=gaps))
 
-    @api.get("/api/cases/{case_id}/section", summary="The section by a plane across the parent axis")
-    def section(
-        abscissa_mm: Finite, treatment: str | None = None, implant: str | None = None, case: Case = of_case
-    ) -> dict[str, Any]:
-        return dict(work.preview(case).section(treatment, implant, abscissa_mm))
+    @api.post("/api/cases/{case_id}/section", summary="The section by a plane across the parent axis")
+    def section(wanted: SectionWanted, case: Case = of_case) -> dict[str, Any]:
+        return dict(work.preview(case).section(wanted.treatment, wanted.implant, wanted.abscissa_mm))
 
     @api.get("/api/cases/{case_id}/flow", summary="Wall shear stress, streamlines and a cut, on one scale (binary)")
     def flow(moment: Moment = None, cut_mm: Finite | None = None, case: Case = of_case) -> Response:

@@ -266,12 +266,12 @@ class Workspace:
                 self._scans[case.id] = (grid, crop), found
             return found
 
-    def outlines(self, case: Case, treatment: str | None, axis: int, index: int, *, is_upright: bool) -> bytes:
+    def outlines(self, case: Case, treatment: Treatment | None, axis: int, index: int, *, is_upright: bool) -> bytes:
         """Return the outlines on a slice as a message for the page."""
         from vstent.app.outlines import outlines
 
         preview = self.preview(case)
-        stents = [] if treatment is None else preview.stents(preview.placed(preview.choice(treatment)))
+        stents = [] if treatment is None else preview.stents(preview.placed(treatment))
         return outlines(self.scan(case).grid(is_upright=is_upright), preview.anatomy, stents, axis, index)
 
     def input_surface(self, case: Case) -> bytes:
