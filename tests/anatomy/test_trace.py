@@ -158,6 +158,21 @@ def test_a_blind_arm_is_opened_and_a_sac_is_not() -> None:
     np.testing.assert_allclose(opened.outlets[0].diameter_mm, 4.0, rtol=0.05)
 
 
+def test_a_blind_arm_with_a_stenosis_at_its_origin_is_opened() -> None:
+    trunk = phantoms.tube(length_mm=28.0)
+    direction = np.array([1.0, 0.0, 1.0])
+    branched = phantoms.with_branch(trunk, abscissa_mm=8.0, direction=direction, radius_mm=1.3, length_mm=24.0)
+    branch = branched.branches[0]
+    narrow = 1.3 - 0.65 * np.exp(-(((branch.abscissa_mm - 7.0) / 2.0) ** 2))
+    vessel = Vessel(
+        phantoms.phantom_surface(replace(branched, branches=(replace(branch, inscribed_radius_mm=narrow),)))
+    )
+    ends_mm = [triangles.polygon_centroid(vessel.lumen.vertices_mm[loop]) for loop in vessel.lumen.boundary_loops]
+    of_branch = int(np.linalg.norm(ends_mm - branch.points_mm[-1], axis=1).argmin())
+    opened, _ = open_ends(Vessel(_domed(vessel, vessel.lumen.boundary_loops[of_branch])))
+    assert [round(o.diameter_mm, 1) for o in opened.openings] == [4.0, 4.0, 2.6]
+
+
 @pytest.mark.parametrize("elongation", [1.0, 1.8])
 def test_stumps_are_opened_where_blood_has_no_other_way_in_and_out_and_a_sac_is_not(elongation: float) -> None:
     short = phantoms.with_sac(phantoms.tube(length_mm=16.0), abscissa_mm=8.0, elongation=elongation)

@@ -36,7 +36,7 @@ ends."""
 ARM_SWELLING: Final = 1.35
 """An arm is a sac on a stalk if its widest sphere near the tip exceeds its median radius by this factor."""
 ARM_WIDENING: Final = 1.6
-"""An arm is a sac with a lobe if it widens by this factor beyond a narrow place, towards its tip."""
+"""An arm that widens by this factor beyond a narrow place begins there: a lobed sac is then short, an artery long."""
 ARM_SHARE: Final = 0.15
 """Largest fraction of the wall that opening an arm removes: its tip with the small branches on it."""
 ARM_RADIUS_MM: Final = 0.5
@@ -231,12 +231,15 @@ def _blind_end(graph: medial.Medial, path: Ints, slenderness: float) -> tuple[Fl
     outside = abscissa > 1.5 * radius_mm[0]
     if label[path[0]] == label[path[-1]] or outside.sum() < 3:
         return None
+    along = np.where(outside, radius_mm, np.inf)
+    widening = np.where(outside, radius_mm, 0.0) / np.minimum.accumulate(along)
+    if widening.max() > ARM_WIDENING:
+        outside &= abscissa >= abscissa[along[: widening.argmax()].argmin()]
     typical = float(np.median(radius_mm[outside]))
     body = outside & (radius_mm > 0.75 * typical)
     length = abscissa[body][-1] - abscissa[body][0]
     outer = body & (abscissa > abscissa[body][0] + 0.5 * length)
-    widening = (radius_mm[outside] / np.minimum.accumulate(radius_mm[outside])).max()
-    if length < slenderness * typical or radius_mm[outer].max() > ARM_SWELLING * typical or widening > ARM_WIDENING:
+    if length < slenderness * typical or radius_mm[outer].max() > ARM_SWELLING * typical:
         return None
     end = float(abscissa[body][-1]) - typical
     center, before = curves.interpolate(abscissa, points_mm, np.array([end, end - 2 * typical]))

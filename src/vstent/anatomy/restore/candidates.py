@@ -38,6 +38,7 @@ def classified(vessel: Vessel, aneurysm: Aneurysm, artery_diameter_mm: float) ->
     height_mm = (dome_mm - plane.center_mm) @ plane.normal
     widths_mm = np.array([_width_mm(aneurysm, fraction * height_mm.max() - height_mm) for fraction in HEIGHTS])
     widest_mm = float(widths_mm.max())
+    tapers = (np.diff(widths_mm) < 0.05 * widest_mm).all() and widths_mm.argmax() <= len(widths_mm) // 4
     sphere_mm = float(np.cbrt(6 * abs(aneurysm.sac.volume_mm3) / np.pi))
     slenderness = reach_mm / max(widest_mm, 1e-9)
     is_narrow = widest_mm < NARROW * artery_diameter_mm
@@ -47,7 +48,7 @@ def classified(vessel: Vessel, aneurysm: Aneurysm, artery_diameter_mm: float) ->
         kind, reasons = "branch stump", [f"it is {slenderness:.1f} times as long as wide", size]
     elif vessel.voxel_mm is not None and widest_mm < FEWEST_VOXELS * vessel.voxel_mm:
         kind, reasons = "artifact", ["it is too small for the voxels of the scan", size]
-    elif widest_mm < STRAIGHT * neck_mm and is_narrow and _tapers(widths_mm) and reach_mm <= FUNNEL_MM:
+    elif widest_mm < STRAIGHT * neck_mm and is_narrow and tapers and reach_mm <= FUNNEL_MM:
         kind, reasons = "infundibulum", ["it tapers from its base", size]
     elif widest_mm < STRAIGHT * neck_mm and is_narrow and slenderness > 1.0:
         kind, reasons = "branch stump", ["it is a tube no wider than its neck", size]
@@ -64,8 +65,3 @@ def _width_mm(aneurysm: Aneurysm, below_mm: Floats) -> float:
     loops = triangles.boundary_loops(vertices, faces)
     areas = [float(np.linalg.norm(triangles.polygon_area_vector(vertices[loop]))) for loop in loops]
     return 2 * float(np.sqrt(max(areas, default=0.0) / np.pi))
-
-
-def _tapers(widths_mm: Floats) -> bool:
-    """Return whether a sac becomes narrower from its base to its top."""
-    return bool((np.diff(widths_mm) < 0.05 * widths_mm.max()).all() and widths_mm.argmax() <= len(widths_mm) // 4)
