@@ -160,7 +160,7 @@ def test_a_ball_is_turned_as_points_are_and_what_names_no_part_is_refused() -> N
     assert settings.flow.numerics.refine == ("branches", (-1.0, 2.0, 3.5, 4.0))
     assert settings.flow.numerics.coarser_levels == 1
     assert replace(settings.flow.numerics, refine=("branches",)).coarser_levels == 0
-    for text in ("neck", "1,2,3", "1,2,3,4,5"):
+    for text in ("neck", "1,2,3", "1,2,3,4,5", "1,2,3,0"):
         with pytest.raises(
             InputError, match=f"'{text}' is no part of a vessel: give sac, inlet, branches, or center and"
         ):

@@ -27,12 +27,7 @@ def add(commands: options.Commands) -> None:
     retention = "carry contrast through these flows too; the time that it stays in the sac counts in their scores"
     options.add_flag(ranking, "retention", retention)
     options.add_workers(ranking)
-    parser.set_defaults(command=_rank)
-
-
-def _rank(arguments: argparse.Namespace) -> int:
-    """Run the command; return the exit code. An interrupted ranking with flows resumes."""
-    return _rank_treatments(arguments) if arguments.treatment else _rank_sizes(arguments)
+    parser.set_defaults(command=lambda given: (_rank_treatments if given.treatment else _rank_sizes)(given))
 
 
 def _rank_treatments(arguments: argparse.Namespace) -> int:

@@ -239,7 +239,7 @@ def build(vessel: Vessel, cell_size_mm: float, window: Window | None = None, wir
         raise CoarseGridError(
             f"at a grid spacing of {cell_size_mm:.3g} mm only {len(cells)} cells are connected to the inlet at "
             f"{place(vessel.inlet.center_mm)}, so the grid is too coarse or the inlet is blocked: use a finer grid "
-            "spacing, or check the inlet"
+            "spacing (a part given by --refine doubles it elsewhere), or check the inlet"
         )
     grid = Cells(cells, origin_mm, cell_size_mm)
     neighbour = grid.neighbours()

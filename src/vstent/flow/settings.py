@@ -42,7 +42,7 @@ def read_region(text: str) -> str | tuple[float, ...]:
     if (word := text.strip()) in ("sac", "inlet", "branches"):
         return word
     with suppress(InputError):
-        if len(found := numbers(word)) == 4:
+        if len(found := numbers(word)) == 4 and found[-1] > 0:
             return found
     raise InputError(
         f"{text!r} is no part of a vessel: give sac, inlet, branches, or center and radius of a ball in mm, such as "

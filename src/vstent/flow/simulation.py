@@ -147,6 +147,8 @@ def _decided(case: FlowCase, start: FlowField | None = None) -> tuple[FlowCase, 
     Where the flow to start from is unsteady, averages need all the time steps.
     """
     are_coils = any(isinstance(one, Coils) for one in case.solids)  # their indices are those of a porous region
+    if case.numerics.wires == "resolved" and case.numerics.engine == LATTICE and case.wires is None and case.media:
+        return case, " The wires are a screen: none of them lies over a neck or a branch."
     if case.numerics.wires != "auto" or case.numerics.engine != LATTICE or case.wires is None or are_coils:
         return (_with_wires(case, "screen") if case.numerics.wires == "auto" else case), ""
     if case.numerics.device_gpu:

@@ -175,6 +175,8 @@ def test_a_device_apart_from_the_neck_has_a_flow_and_says_that_it_is_not_calibra
     assert estimate(away).cells > 0
     field = simulate_case(with_numerics(away, wires="calibrated", max_steps=100))
     assert "The screen is not calibrated: no wires over the neck" in field.advice
+    field = simulate_case(with_numerics(replace(away, solids=()), wires="resolved", max_steps=100))
+    assert "The wires are a screen: none of them lies over a neck or a branch." in field.advice
 
 
 def test_the_cost_of_a_calibrated_flow_contains_its_tiles(braided: FlowCase) -> None:

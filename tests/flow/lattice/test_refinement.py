@@ -23,7 +23,7 @@ from vstent.flow.case import FlowCase, FlowField, Sheet, Target
 from vstent.flow.ends import FlowRate
 from vstent.flow.grade import measures_of
 from vstent.flow.indices import indices
-from vstent.flow.lattice import levels
+from vstent.flow.lattice import levels, stepping
 from vstent.flow.lattice.cost import estimate
 from vstent.flow.lattice.engine import LatticeBoltzmann, PulsatileLatticeBoltzmann
 from vstent.flow.lattice.levels import box_points, further_levels, near_sac, window
@@ -442,6 +442,18 @@ def test_a_ball_that_reaches_no_wall_is_refined_and_changes_no_flow() -> None:
     assert not len(LatticeBoltzmann(0.3).init(refined, None).levels[1].domain.link_cell)
     speeds_m_s = [sampling.values_at(simulate_case(case), at_mm)[0][:, 2] for case in (whole, refined)]
     np.testing.assert_allclose(*speeds_m_s, rtol=0.01)
+
+
+def test_a_ball_before_an_opening_is_computed_and_one_around_an_end_foretold() -> None:
+    """From the first too little blood is refined to be carried back; the second reaches into the extension."""
+    vessel = tube(line(20.0), RADIUS_MM).vessel
+    for ball_mm in ((0.0, 0.0, -1.0, 1.5), (0.0, 0.0, 20.0, 2.0)):
+        numerics = Numerics(cell_size_mm=0.2, refine=(ball_mm,))
+        case = vessel_case(vessel, FlowSettings(inflow_mL_s=1.0, numerics=numerics))
+        state = LatticeBoltzmann(0.2).init(case, None)
+        stepping.advance(state, 4)
+        assert 0.95 < estimate(case).cells / sum(len(level.domain.cells) for level in state.levels) < 1.3
+        assert all(np.isfinite(one.velocity_m_s).all() for one in stepping.snapshots(state))
 
 
 def test_a_jet_from_a_narrow_inlet_is_that_of_the_fine_grid() -> None:

@@ -44,6 +44,8 @@ second against 440 in the block; 3.4 for C0038 at 0.2 mm, 4.8 for a small bifurc
 AROUND_WIRES_OVER_BLOCK = 7.0
 """The same with finer levels around wires, where most of the time goes into the exchange between thin levels (demo with
 Enterprise from 0.16 to 0.02 mm: 65 million updates per second on two cores)."""
+EXCHANGE_S = 1e-4
+"""Run time of an exchange between two levels besides that of their cells (a ball of 0.7 mm in the demo at 0.3 mm)."""
 BLOCK_ROWS = 4095
 """Number of rows of the block used to measure the speed; odd, so that populations are not whole pages apart (see
 `setup.PAGE`)."""
@@ -89,7 +91,8 @@ def seconds_of(case: FlowCase, cell_size_mm: float, steps: float) -> float:
     of_levels, kept = _cells(case, cell_size_mm), 1 + case.numerics.coarser_levels
     per_step = np.array(of_levels) * WIDTH ** np.arange(1.0 - len(of_levels), 1.0)
     in_block = WHOLE_OVER_BLOCK * per_step[:kept].sum() + AROUND_WIRES_OVER_BLOCK * per_step[kept:].sum()
-    return float(in_block) * steps / block_rate(on_gpu=case.numerics.device_gpu)
+    exchange_s = EXCHANGE_S * (len(of_levels) > 1)
+    return steps * float(in_block / block_rate(on_gpu=case.numerics.device_gpu) + exchange_s)
 
 
 def _cells(case: FlowCase, cell_size_mm: float) -> list[float]:

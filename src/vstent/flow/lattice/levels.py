@@ -313,7 +313,7 @@ def volume_mm3(case: FlowCase, size_mm: float, cell_size_mm: float) -> float:
         edges_mm = (spheres[:, :3] + spheres[:, 3:]).max(axis=0) - low_mm
         step_mm = max(size_mm, 0.01 * float(np.cbrt(edges_mm.prod())))  # at most a million points
         x, y, z = np.ceil(edges_mm / step_mm).astype(int)
-        blood = np.argwhere(voxels.fill((case.vessel.closed.corners_mm - low_mm) / step_mm, (x, y, z)))
+        blood = np.argwhere(voxels.fill((domains.extend(case.vessel)[0].corners_mm - low_mm) / step_mm, (x, y, z)))
         result += float(_in(spheres, low_mm + step_mm * blood).sum()) * step_mm**3
     return min(result, domains.extended_volume_mm3(case.vessel))
 
@@ -560,7 +560,7 @@ def _weights(source: Domain, other: Domain, target: Ints) -> tuple[Ints, Ints, N
 
 def _product(along_x: Floats, along_y: Floats, along_z: Floats) -> Floats:
     """Return the products (m, 64) of weights (m, 4) along the three axes."""
-    return np.einsum("ma,mb,mc->mabc", along_x, along_y, along_z).reshape(len(along_x), -1)
+    return np.einsum("ma,mb,mc->mabc", along_x, along_y, along_z).reshape(-1, 64)
 
 
 def _beside_wall(source: Domain, other: Domain, target: Ints, cell: Ints, away: Floats) -> tuple[Floats, Floats]:
