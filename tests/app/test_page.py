@@ -328,6 +328,7 @@ def test_the_section_has_the_phantoms_radius(client, case, workspace):
     start, _ = app_case.opened(client.post(f"{case}/sketch", json=wanted(SILK)))
     place = start["ends_mm"][0] + 1.0
     section = client.post(f"{case}/section", json={"abscissa_mm": place, "treatment": SILK, "implant": "silk"}).json()
+    assert client.post(f"{case}/section", json={"abscissa_mm": 2000.0}).status_code == 422
     segments = np.array(section["landing"]).reshape(-1, 2, 2)
     near = np.linalg.norm(segments, axis=2).max(axis=1) < section["artery_diameter_mm"]
     length = np.linalg.norm(segments[near, 1] - segments[near, 0], axis=1).sum()

@@ -91,8 +91,7 @@ def seconds_of(case: FlowCase, cell_size_mm: float, steps: float) -> float:
     of_levels, kept = _cells(case, cell_size_mm), 1 + case.numerics.coarser_levels
     per_step = np.array(of_levels) * WIDTH ** np.arange(1.0 - len(of_levels), 1.0)
     in_block = WHOLE_OVER_BLOCK * per_step[:kept].sum() + AROUND_WIRES_OVER_BLOCK * per_step[kept:].sum()
-    exchange_s = EXCHANGE_S * (len(of_levels) > 1)
-    return steps * float(in_block / block_rate(on_gpu=case.numerics.device_gpu) + exchange_s)
+    return steps * float(in_block / block_rate(on_gpu=case.numerics.device_gpu) + EXCHANGE_S * (len(of_levels) > 1))
 
 
 def _cells(case: FlowCase, cell_size_mm: float) -> list[float]:
