@@ -293,6 +293,14 @@ def test_a_device_dragged_out_of_the_artery_is_refused_with_a_sentence(client, c
     assert said in answer.json()["detail"]
 
 
+def test_a_number_that_json_does_not_know_is_refused_by_its_name(client, case):
+    body = json.dumps(wanted(SILK, anchor="distal", abscissa_mm=float("nan")))
+    answer = client.post(f"{case}/sketch", content=body, headers={"content-type": "application/json"})
+    assert answer.status_code == 422
+    (fault,) = answer.json()["detail"]
+    assert (fault["loc"][-1], fault["msg"]) == ("abscissa_mm", "Input should be a finite number")
+
+
 def test_deployed_numbers_are_those_of_the_measures(client, case, workspace):
     anatomy = anatomy_of(client, case, workspace)
     center_mm = round(anatomy.parent.axis.length_mm / 2, 3)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 from fastapi import APIRouter, Depends, FastAPI, Query, Request
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from pydantic import Field
 
@@ -132,6 +133,7 @@ def create(work: Workspace, *, token: str, hosts: tuple[str, ...]) -> Guard:
         lifespan=life,
     )
     app.add_exception_handler(VstentError, _refused)
+    app.add_exception_handler(RequestValidationError, _refused)
     _add_page(app)
     api = APIRouter(dependencies=[Depends(work.load)])
 
@@ -146,6 +148,9 @@ def create(work: Workspace, *, token: str, hosts: tuple[str, ...]) -> Guard:
 
 def _refused(_: Request, error: Exception) -> JSONResponse:
     """Return an error as a JSON response."""
+    if isinstance(error, RequestValidationError):
+        # FastAPI would repeat the input, and a NaN in it is not JSON.
+        return JSONResponse({"detail": [{"loc": one["loc"], "msg": one["msg"]} for one in error.errors()]}, 422)
     codes: dict[type[Exception], int] = {Conflict: 409, Absent: 404}
     code = codes.get(type(error), 422 if isinstance(error, InputError) else 500)
     return JSONResponse({"detail": str(error)}, code)

@@ -249,7 +249,10 @@ def as_html(told: Contents) -> str:
         "definitions": "Definitions",
         "provenance": "Method",
     }
-    environment = Environment(loader=PackageLoader("vstent.reporting", "assets"), autoescape=True, finalize=_said)
+    loader = PackageLoader("vstent.reporting", "assets")
+    environment = Environment(
+        loader=loader, autoescape=True, finalize=lambda shown: spoken(shown) if type(shown) is str else shown
+    )
     return environment.get_template("report.html.j2").render(
         told=told,
         sections=[(name, title) for name, title in sections.items() if title],
@@ -265,11 +268,6 @@ def as_html(told: Contents) -> str:
         manifest=manifest,
         scene_bytes=Markup(scene_bytes),
     )
-
-
-def _said(value: Any) -> Any:
-    """Return what a template shows: sentences as a page says them."""
-    return spoken(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
 
 def asset(name: str) -> str:

@@ -176,7 +176,9 @@ def average(values: Floats) -> tuple[float, float]:
     agreeing = {round(len(values) * part) for part in (0.7, 0.8, 0.9, 1.0)}
     left = CAUTION * max(fraction_left(values[:n, None]) for n in agreeing)
     lengths = {max(1, len(values) >> halvings) for halvings in range(WINDOWS)}
-    means = (_by_means(values[-n:]) for n in lengths)
+    ends = [values[-n:] for n in lengths]
+    errors = [float("inf") if _drifts(end) else SURE * standard_error(end[:, None]) for end in ends]
+    means = [(float(end.mean()), error) for end, error in zip(ends, errors, strict=True)]
     return min([(late, left), *means, _by_range(values)], key=lambda one: one[1])
 
 
@@ -184,11 +186,6 @@ def _drifts(values: Floats) -> bool:
     """Return whether the means of both halves of values (n,) differ by more than `DRIFT` times their range."""
     before, last = np.array_split(values, 2)
     return bool(abs(last.mean() - before.mean()) > DRIFT * np.ptp(values)) if len(before) and len(last) else True
-
-
-def _by_means(values: Floats) -> tuple[float, float]:
-    """Return the mean of values (n,) and `SURE` times its standard error, as a fraction; inf where they drift."""
-    return float(values.mean()), float("inf") if _drifts(values) else SURE * standard_error(values[:, None])
 
 
 def _by_range(values: Floats) -> tuple[float, float]:
