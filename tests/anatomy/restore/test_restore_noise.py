@@ -46,16 +46,18 @@ def known(short: str) -> pytest.MarkDecorator:
 # What a tenth of a voxel does to necks. C0038 and beta have triangles of 0.15 to 0.2 mm, which white noise crumples.
 @pytest.mark.validation
 @pytest.mark.parametrize(
-    ("name", "kinds", "area"),
+    ("name", "kinds", "volume", "area"),
     [
-        ("visc2011_metres.stl", ("white", "smooth"), 0.06),
-        ("bifurcation_coarse.vtp", ("white",), 0.05),
-        pytest.param("siphon_dirty.stl", ("white",), 0.08, marks=known("volume 8 to 11 %: caps and a branch are lost")),
-        ("aneurisk_C0038.vtp", ("smooth",), 0.06),
-        pytest.param("aneurisk_beta.vtp", ("smooth",), 0.05, marks=known("neck 16 % with one of five seeds")),
+        ("visc2011_metres.stl", ("white", "smooth"), 0.05, 0.06),
+        ("bifurcation_coarse.vtp", ("white",), 0.01, 0.02),
+        pytest.param("siphon_dirty.stl", ("white",), 0.05, 0.08, marks=known("volume 8 to 11 %: a branch is lost")),
+        ("aneurisk_C0038.vtp", ("smooth",), 0.05, 0.06),
+        pytest.param("aneurisk_beta.vtp", ("smooth",), 0.05, 0.05, marks=known("neck 16 % with one of five seeds")),
     ],
 )
-def test_real_necks_and_sacs_stand_noise(shared_data, name: str, kinds: tuple[str, ...], area: float) -> None:
+def test_real_necks_and_sacs_stand_noise(
+    shared_data, name: str, kinds: tuple[str, ...], volume: float, area: float
+) -> None:
     wall = repair(read_surface(shared_data / name)[0])[0]
     anatomy = _anatomy(wall)
     still, outlet_mm = anatomy.aneurysms[0], anatomy.parent.axis.points_mm[-1]  # the challenge's fork is one of equals
@@ -63,7 +65,7 @@ def test_real_necks_and_sacs_stand_noise(shared_data, name: str, kinds: tuple[st
         for seed in (1, 2, 3):
             moved = _anatomy(_shaken(wall, kind, seed), outlet_mm).aneurysms[0]
             print(name, kind, seed, moved.sac.volume_mm3, moved.neck.area_mm2)  # noqa: T201
-            assert moved.sac.volume_mm3 == pytest.approx(still.sac.volume_mm3, rel=0.05)
+            assert moved.sac.volume_mm3 == pytest.approx(still.sac.volume_mm3, rel=volume)
             assert moved.neck.area_mm2 == pytest.approx(still.neck.area_mm2, rel=area)
 
 
